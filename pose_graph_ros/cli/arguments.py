@@ -281,8 +281,6 @@ def _add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> 
 def _add_replayed(parser: argparse.ArgumentParser) -> None:
     """Add the options that say what is read of bags and of a g2o file, and how."""
     _add_span(parser)
-    parser.add_argument('--stamps', metavar='FILE', type=Path, help='text file with the stamps '
-                        '[s] of the vertices of a .g2o file (default: a second apart)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
     _add_inputs(parser)

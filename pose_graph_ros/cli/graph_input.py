@@ -6,7 +6,7 @@ Read a graph from a g2o file or a saved graph, and choose its nodes by their ids
 A g2o, TORO or iSAM file as odometry and loop closures over time, as if a robot sent them.
 
 An edge from each vertex to the next one is odometry; its other edges are loop closures, which come
-when the later one of their ends is reached. The vertices are a second apart, or have given stamps.
+when the later one of their ends is reached. The vertices are a second apart.
 """
 
 from collections.abc import Iterator
@@ -81,30 +81,15 @@ def rows_of(ids: se2.IntArray, text: str, option: str) -> se2.IntArray:
     return np.flatnonzero(chosen)
 
 
-def read_measurements(path: Path, stamps: Path | None = None,
-                      edge2: str | None = None) -> list[OdometrySample | LoopClosure]:
+def read_measurements(path: Path, edge2: str | None = None) -> list[OdometrySample | LoopClosure]:
     """
     Return the measurements in a g2o file, in the order in which they come.
 
-    The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Each line
-    of the file of stamps begins with that of a vertex [s]. Raises FileFormatError if a vertex has
-    no edge to the next one.
+    The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Raises
+    FileFormatError if a vertex has no edge to the next one.
     """
     file = read_file(path, edge2)
     edges, n = file.graph.factors.edges, file.graph.n_nodes
-    stamps_ns = SECOND * np.arange(1, n + 1)
-    if stamps is not None:
-        try:
-            words = [line.split()[0] for line in stamps.read_text(encoding='utf-8').splitlines()
-                     if line.strip() != '' and not line.startswith('#')]
-            stamps_ns = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
-        except (OSError, ValueError, OverflowError) as error:
-            raise FileFormatError(f'{stamps}: expected a stamp [s] at the begin of each line '
-                                  f'({error})') from error
-        if len(stamps_ns) < n or np.any(np.diff(stamps_ns[:n]) <= 0):
-            raise FileFormatError(
-                f'{stamps}: expected {n} increasing stamps, got {len(stamps_ns)}')
-        stamps_ns = stamps_ns[:n]
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
     # of several edges the first one in the file is odometry
     starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
@@ -118,25 +103,28 @@ def read_measurements(path: Path, stamps: Path | None = None,
     last = np.maximum(edges.i, edges.j)[closures].tolist()
     others = edges.rows(closures)
     events: list[tuple[int, OdometrySample | LoopClosure]] = [
-        *enumerate(_odometry(edges.rows(odometry), stamps_ns)),
+        *enumerate(_odometry(edges.rows(odometry))),
         # covariances from the axes of the measured pose to those of the reference
-        *((when, LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
-                             reference_ns=int(stamps_ns[i])))
+        *((when, LoopClosure(_stamp(int(j)), mean, covariance.turned(cov, -float(mean[2])),
+                             reference_ns=_stamp(int(i))))
           for when, i, j, mean, cov in zip(
               last, others.i, others.j, others.mean, _covariances(others), strict=True))]
     return [each for _, each in sorted(events, key=itemgetter(0))]
 
 
-def _odometry(edges: Factors, stamps_ns: se2.IntArray) -> Iterator[OdometrySample]:
+def _odometry(edges: Factors) -> Iterator[OdometrySample]:
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
     motions = np.where((edges.i < edges.j)[:, None], edges.mean, se2.inverse(edges.mean))
-    variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
-    elapsed, pose = np.diff(stamps_ns) * 1e-9, np.zeros(3)
-    for k, stamp_ns in enumerate(stamps_ns.tolist()):
-        step = min(k, len(motions) - 1)
-        yield OdometrySample(stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
-                             variances[step] / elapsed[step])
-        pose = se2.compose(pose, motions[step])
+    variances, pose = np.diagonal(_covariances(edges), axis1=1, axis2=2), np.zeros(3)
+    for k in range(len(motions) + 1):
+        # in a second each
+        motion, variance = (each[min(k, len(motions) - 1)] for each in (motions, variances))
+        yield OdometrySample(_stamp(k), pose, float(np.hypot(*motion[:2])), variance)
+        pose = se2.compose(pose, motion)
+
+
+def _stamp(vertex: int) -> int:
+    return SECOND * (vertex + 1)
 
 
 def _covariances(edges: Factors) -> se2.FloatArray:

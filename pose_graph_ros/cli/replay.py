@@ -311,7 +311,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
-                    for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
+                    for each in read_measurements(options.bags[0], options.edge2)]
     result = run(measurements, values)
     drive = collect_drive(
         ((*each, False) for each in measurements), result.backend, odometry, result.refused)

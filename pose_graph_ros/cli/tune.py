@@ -164,10 +164,8 @@ class Tuning:
                     found.append((name, one.measurement, len(one.repairs) > 0))
         return found
 
-    def _run(
-        self, values: Values, text: str, without: Collection[Key] = (),
-        odometry: str = '',
-    ) -> PoseGraphBackend:
+    def _run(self, values: Values, text: str, without: Collection[Key] = (),
+             odometry: str = '') -> PoseGraphBackend:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         _show(f'step {self._step} of {self._steps}: {text}')
@@ -176,17 +174,15 @@ class Tuning:
                 odometry in ('', name) if isinstance(each, OdometrySample)
                 else (name, each.stamp_ns) not in without)), values).backend
 
-    def _runs(
-        self, text: str, left_out: Collection[Key] = (),
-    ) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
+    def _runs(self, text: str,
+              left_out: Collection[Key] = ()) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
         """Return a run with the settings before, and those that show the noise of odometries."""
         before = self._run(self._values, f'{text}, with the settings before', left_out)
         return before, [before] if self._is_shown_before else [self._run(
             self._looking, f'{text}, by {name}', left_out, name) for name in self._odometries]
 
-    def _estimate(
-        self, runs: Sequence[PoseGraphBackend], without: Collection[Key],
-    ) -> tuple[list[Tuned], Seconds]:
+    def _estimate(self, runs: Sequence[PoseGraphBackend],
+                  without: Collection[Key]) -> tuple[list[Tuned], Seconds]:
         """Return what runs show, but for some measurements, and the longest time constant."""
         tuned, longest = list[Tuned](), 0.0
         for name, engine in zip(self._odometries, runs, strict=True):
@@ -237,10 +233,8 @@ class Tuning:
             inside and name not in self._repaired and len(policy.override) == 0,
             *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0 for each in both))
 
-    def _fold(
-        self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
-        truth: Trajectory | None,
-    ) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
+    def _fold(self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
+              truth: Trajectory | None) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
         """
         Return errors of the paths before and after at a part that is held out, and to the truth.
 
@@ -272,9 +266,8 @@ class Tuning:
             raise BagError(f'{self._path}: the odometry makes no path')
         return estimate.path, backend.path_covariances(estimate)
 
-    def _errors(
-        self, values: Values, backend: PoseGraphBackend, held: Collection[Key],
-    ) -> list[Errors]:
+    def _errors(self, values: Values, backend: PoseGraphBackend,
+                held: Collection[Key]) -> list[Errors]:
         """Return the errors of a path at what was held out of each source, and at closures."""
         reports, valid, (path, covariances) = (
             backend.reports(), self._valid(values), self._path_of(backend))

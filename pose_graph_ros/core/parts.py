@@ -244,9 +244,8 @@ def _joint(smoother: IncrementalSmoother, ids: list[int]) -> FloatArray:
     return joint.reshape(3 * len(ids), -1)
 
 
-def _linearized(
-    edge: Factors, state: FloatArray, ids: list[int],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _linearized(edge: Factors, state: FloatArray,
+                ids: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what was measured less what is expected, its Jacobian, and its covariance."""
     information = edge.weighted_information[0]
     used = np.flatnonzero(np.diagonal(information) > 0.0)

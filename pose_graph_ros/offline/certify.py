@@ -125,10 +125,8 @@ class NearHessian(NamedTuple):
         return 1j * y * change  # it turns a heading at a right angle
 
 
-def certify(
-    formulation: Formulation, poses: Poses, *, eigenvalue: bool = True,
-    hessian: NearHessian | None = None,
-) -> Certificate:
+def certify(formulation: Formulation, poses: Poses, *, eigenvalue: bool = True,
+            hessian: NearHessian | None = None) -> Certificate:
     """
     Return a certificate for the minimum of the objective near some poses, or for a lower one.
 
@@ -229,9 +227,8 @@ def _definite(form: QuadraticForm, shift: FloatArray) -> BlockFactors | None:
     return factors if factors.is_positive else None
 
 
-def _smallest(
-    form: QuadraticForm, factors: BlockFactors, sigma: float, known: ComplexArray | None,
-) -> tuple[float | None, ComplexArray | None]:
+def _smallest(form: QuadraticForm, factors: BlockFactors, sigma: float,
+              known: ComplexArray | None) -> tuple[float | None, ComplexArray | None]:
     """Return the smallest eigenvalue of S, orthogonal to the known vectors, and its vector."""
     n = form.n
     if n < 3 + (0 if known is None else known.shape[1]):
@@ -280,9 +277,8 @@ def multipliers(y: ComplexArray, product: ComplexArray) -> FloatArray:
     return np.asarray(np.sum(y.real * product.real + y.imag * product.imag, axis=1))
 
 
-def minimized(
-    form: QuadraticForm, y: ComplexArray, precondition: Preconditioner | None = None,
-) -> ComplexArray:
+def minimized(form: QuadraticForm, y: ComplexArray,
+              precondition: Preconditioner | None = None) -> ComplexArray:
     """
     Return headings at a minimum of f near the given ones, or where steps no longer lower it.
     """
@@ -333,10 +329,8 @@ def _projection(y: ComplexArray) -> Callable[[ComplexArray], ComplexArray]:
     return tangent
 
 
-def _step(
-    form: QuadraticForm, precondition: Preconditioner, at: tuple[ComplexArray, FloatArray],
-    gradient: ComplexArray, radius: float,
-) -> tuple[ComplexArray, float, bool]:
+def _step(form: QuadraticForm, precondition: Preconditioner, at: tuple[ComplexArray, FloatArray],
+          gradient: ComplexArray, radius: float) -> tuple[ComplexArray, float, bool]:
     """
     Return a step, the decrease of f that it should bring, and whether the radius limits it.
 

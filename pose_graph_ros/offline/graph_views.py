@@ -217,10 +217,8 @@ def _used(graph: Any, view: Any) -> list[Term]:
     return used
 
 
-def _add(
-    view: Any, letter: str, role: Role, term: Term, *, ends: tuple[int, ...] | None = None,
-    away: bool = True, directed: bool = True,
-) -> None:
+def _add(view: Any, letter: str, role: Role, term: Term, *, ends: tuple[int, ...] | None = None,
+         away: bool = True, directed: bool = True) -> None:
     """Add the vertex of a term, with arcs to its hidden nodes or some of them, or from them."""
     vertex, numbers = max(view, default=-1) + 1, view.graph['numbers']
     view.add_node(vertex, name=f'{letter}{numbers[letter]}', role=role, term=term)

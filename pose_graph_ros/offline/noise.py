@@ -173,9 +173,8 @@ def fitted(rows: Records) -> Noise:
                  _shown(rows, seconds), seconds)
 
 
-def _at(
-    posterior: Posterior, best: Minimum, axis: int, exponent: float, fixed: Collection[int],
-) -> Minimum:
+def _at(posterior: Posterior, best: Minimum, axis: int, exponent: float,
+        fixed: Collection[int]) -> Minimum:
     """Return the minimum near a point with another exponent on an axis."""
     free = [other for other, at in enumerate(best.point)
             if other not in fixed and not (other >= SLOW and best.point[SLOW] == learning.NO_SLOW)]
@@ -183,9 +182,8 @@ def _at(
     return to_the_end(learning.descend(posterior, [start], free))
 
 
-def _interval(
-    posterior: Posterior, best: Minimum, axis: int, kept: Collection[int], unit: float,
-) -> Found:
+def _interval(posterior: Posterior, best: Minimum, axis: int, kept: Collection[int],
+              unit: float) -> Found:
     """Return the exponent on an axis with its interval, as a number of units."""
     ends = []
     for sign in (-1.0, 1.0):
@@ -297,10 +295,8 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     return min(wanted, duration / (LEAST_STRETCHES * folds))
 
 
-def errors_at(
-    path: Trajectory, covariances: FloatArray, held_out: Sequence[Position | GlobalPose],
-    factor: float,
-) -> Errors:
+def errors_at(path: Trajectory, covariances: FloatArray, held_out: Sequence[Position | GlobalPose],
+              factor: float) -> Errors:
     """
     Return the errors of a path at valid positions that it covers.
 

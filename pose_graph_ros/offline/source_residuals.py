@@ -157,9 +157,8 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
             for source, each in found.items() if len(each.ids) > 0}
 
 
-def _residuals(
-    graph: Graph, name: tuple[str, str], ids: IntArray, stamps_ns: StampsNs, scales: FloatArray,
-) -> SourceResiduals:
+def _residuals(graph: Graph, name: tuple[str, str], ids: IntArray, stamps_ns: StampsNs,
+               scales: FloatArray) -> SourceResiduals:
     """
     Return the residuals of factors of a source and kind; what the fit takes is not computed.
 
@@ -253,9 +252,8 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
                     independent, scale * ratio, scale * low, scale * high)
 
 
-def _row(
-    used: SourceResiduals, known: SourceResiduals, row: int, errors: CorrelatedErrors | None,
-) -> RowFit:
+def _row(used: SourceResiduals, known: SourceResiduals, row: int,
+         errors: CorrelatedErrors | None) -> RowFit:
     """Return the fit of one coordinate."""
     measured = used.measured[:, row]
     sigma = used.sigmas[measured, row]
@@ -270,9 +268,8 @@ def _row(
                   *_ratio(values**2, np.ones(len(values)), left, independent))
 
 
-def _ratio(
-    squares: FloatArray, freedom: FloatArray, redundancy: float, independent: float,
-) -> tuple[float, float, float]:
+def _ratio(squares: FloatArray, freedom: FloatArray, redundancy: float,
+           independent: float) -> tuple[float, float, float]:
     """Return the ratio of sigmas with its interval, by squares of which a share is left."""
     # where the fit takes nearly all, nothing is said either
     if independent < LEAST_INDEPENDENT or redundancy < 0.005:
@@ -299,9 +296,8 @@ def _quantiles(freedom: FloatArray | BoolArray, probability: float) -> FloatArra
     return np.asarray(values[np.clip(freedom.astype(np.int64), 1, _COORDINATES) - 1])
 
 
-def _independent(
-    values: FloatArray, left: float, stamps_ns: StampsNs, errors: CorrelatedErrors | None,
-) -> float:
+def _independent(values: FloatArray, left: float, stamps_ns: StampsNs,
+                 errors: CorrelatedErrors | None) -> float:
     """Return the effective number of independent squares, of which the fit leaves a share."""
     n, correlated = len(values), 1.0 + 2.0 * squared_correlations(values)
     found = min(n / correlated, n * left, n * left**2 * correlated)

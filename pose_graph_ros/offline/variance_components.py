@@ -124,9 +124,8 @@ def constraints(graph: Graph) -> Constraints:
                        priors[free][:, free], used)
 
 
-def restricted_likelihood(
-    data: Constraints, components: FloatArray, fixed: FloatArray,
-) -> Found | None:
+def restricted_likelihood(data: Constraints, components: FloatArray,
+                          fixed: FloatArray) -> Found | None:
     """
     Return the factors on the sigmas of components; None if they cannot be found.
 
@@ -168,10 +167,9 @@ def restricted_likelihood(
     return None
 
 
-def _statistics(
-    data: Constraints, total: FloatArray, roots: FloatArray, ranks: IntArray,
-    signs: FloatArray, *, right: FloatArray | None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _statistics(data: Constraints, total: FloatArray, roots: FloatArray, ranks: IntArray,
+                signs: FloatArray, *,
+                right: FloatArray | None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return tr(P V_k), the information on the logarithms of sigmas, and squared residuals."""
     n, weights, ends = len(roots), inverse(total, data.measured), np.arange(len(total) + 1)
     weighted = (bsr_array((weights, ends[:-1], ends)) @ data.jacobian).tocsr()
@@ -239,9 +237,8 @@ def analyse(parts: Parts) -> Analysis:
     return Analysis(residuals, fits, correlated)
 
 
-def _together(
-    parts: Parts, at_estimate: Mapping[str, ScaleFit], sources: Mapping[str, SourceResiduals],
-) -> dict[str, ScaleFit]:
+def _together(parts: Parts, at_estimate: Mapping[str, ScaleFit],
+              sources: Mapping[str, SourceResiduals]) -> dict[str, ScaleFit]:
     """Return the fits of some sources with the factors of all of them in one estimate."""
     graph, nodes = parts.graph, parts.nodes
     data = constraints(graph)

@@ -55,23 +55,6 @@ def test_covariances_are_in_the_axes_that_the_engine_wants(tmp_path) -> None:
         np.linalg.inv(in_edge), [[100, 3, 0], [3, 25, 1], [0, 1, 400]], atol=1e-9)
 
 
-def test_stamps_come_from_a_file(square, tmp_path) -> None:
-    stamps = tmp_path / 'stamps.txt'
-    stamps.write_text('# of a camera\n' + '\n'.join(f'{100.5 + 2 * k} 1 2' for k in range(9)))
-    found = read_measurements(square, stamps)
-    assert found[0].stamp_ns == 100_500_000_000
-    samples = [each for each in found if isinstance(each, OdometrySample)]
-    np.testing.assert_allclose(samples[0].twist_variance * 2.0, [0.0025, 0.0025, 0.0004])
-    assert samples[0].speed == 0.5
-
-
-@pytest.mark.parametrize('text', ['1\n2\n', '1\n2\nx\n', '\n'.join('987654321')])
-def test_bad_stamps_are_refused(square, tmp_path, text) -> None:
-    (tmp_path / 'stamps.txt').write_text(text)
-    with pytest.raises(FileFormatError, match='stamp'):
-        read_measurements(square, tmp_path / 'stamps.txt')
-
-
 def test_a_graph_without_odometry_is_refused_by_the_vertices(tmp_path) -> None:
     path = tmp_path / 'lone.g2o'
     path.write_text(f'EDGE_SE2 0 1 {STEP}\nEDGE_SE2 0 7 {LOOP}\n')

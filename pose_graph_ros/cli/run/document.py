@@ -244,10 +244,8 @@ def _by_source(sources: Sequence[str], stamps: IntArray) -> Iterator[tuple[str, 
         yield source, rows[np.argsort(stamps[rows], kind='stable')]
 
 
-def _judged(
-    keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdict],
-    reasons: Mapping[Key, str], frame: Frame,
-) -> dict[str, Any]:
+def _judged(keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdict],
+            reasons: Mapping[Key, str], frame: Frame) -> dict[str, Any]:
     """Return the columns of what is believed, and why not."""
     found, whys = [verdicts.get(key) for key in keys], []
     for key, state, each in zip(keys, states.tolist(), found, strict=True):
@@ -261,9 +259,8 @@ def _judged(
             'd': rounded([np.nan if each is None else each.distance for each in found], 2)}
 
 
-def _fixes(
-    drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray, frame: Frame,
-) -> list[dict[str, Any]]:
+def _fixes(drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray,
+           frame: Frame) -> list[dict[str, Any]]:
     """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
     found = []
     for source, every in _by_source(drive.fix_sources, drive.fix_stamps_ns):
@@ -283,9 +280,8 @@ def _fixes(
     return found
 
 
-def _closures(
-    drive: Drive, verdicts: Mapping[Key, Verdict], reasons: Mapping[Key, str], frame: Frame,
-) -> list[dict[str, Any]]:
+def _closures(drive: Drive, verdicts: Mapping[Key, Verdict], reasons: Mapping[Key, str],
+              frame: Frame) -> list[dict[str, Any]]:
     """Return the loop closures of each source, in the order of their later ends."""
     path, found = drive.corrected, []
     for source, every in _by_source(drive.loop_sources, drive.loop_stamps_ns[:, 1]):

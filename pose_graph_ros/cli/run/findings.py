@@ -39,9 +39,8 @@ class Finding(NamedTuple):
     anchor: str  # on the page: `map`, `updates`, `errors`, or `source-NAME`
 
 
-def findings(
-    run: Run, analyses: Mapping[str, SourceAnalysis], errors: Mapping[str, Any] | None,
-) -> list[dict[str, Any]]:
+def findings(run: Run, analyses: Mapping[str, SourceAnalysis],
+             errors: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """Return all findings for run.json, the worst first; `errors` are those over time in it."""
     found = [*_whole(run), *_covariances(run, analyses)]
     for source in sorted({each.source for each in run.verdicts}):
@@ -236,9 +235,8 @@ def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
     return np.column_stack((newest[found], newest[found + 1])) * 1e-9
 
 
-def silences(
-    arrived_ns: Mapping[str, Sequence[StampNs]], kinds: Mapping[str, Kind], start_ns: StampNs,
-) -> Iterator[Finding]:
+def silences(arrived_ns: Mapping[str, Sequence[StampNs]], kinds: Mapping[str, Kind],
+             start_ns: StampNs) -> Iterator[Finding]:
     """Yield silences of odometry, and of fixes and global poses."""
     for source, stamps_ns in arrived_ns.items():
         kind = kinds.get(source)
