@@ -106,8 +106,6 @@ def demo(parser: argparse.ArgumentParser) -> None:
                         help='folder for the results (default: %(default)s)')
     parser.add_argument('--rate', type=float, default=50.0, help='speed as a multiple of real '
                         'time, 0 for as fast as the node can (default: %(default)s)')
-    parser.add_argument('--seed', type=int, default=1, help='seed of the simulated drive '
-                        '(default: %(default)s)')
     _add_inputs(parser)
     _add_parameters(parser)
 

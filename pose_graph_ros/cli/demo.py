@@ -53,8 +53,8 @@ def execute(options: argparse.Namespace) -> int:
     title = 'Simulated drive' if bag_path is None else bag_path.stem
     if bag_path is None:
         bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
-        print(f'simulating a drive (seed {options.seed})')
-        way = recording.course(worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
+        print('simulating a drive')
+        way = recording.course(worlds.WORLDS['drive'], 1, settings.DURATIONS_S['drive'])
         simulate.write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}

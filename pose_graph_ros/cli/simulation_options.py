@@ -23,8 +23,8 @@ FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, and where their values are.
 ONLY_IN_BAGS = {'--odometry': 'wheels.errors', '--slip': 'wheels.slip_events_per_s',
                 '--heading-drift': 'wheels.heading_drift',
-                '--gyro': 'gyro', '--gyro-noise': 'gyro.sigma,bias,bias_walk', '--delay': 'delay',
-                '--duplicate': 'duplicate', '--clock-offset': 'clock_offset'}
+                '--gyro': 'gyro', '--delay': 'delay', '--duplicate': 'duplicate',
+                '--clock-offset': 'clock_offset'}
 SENSORS: dict[str, Any] = {'wheels': settings.Wheels, 'gyro': settings.Gyro,
                            'fixes': settings.Fixes, 'poses': settings.GlobalPoses,
                            'closures': settings.Closures}
@@ -113,10 +113,6 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
                         '[rad/m] (default: 0)')
     gyro = parser.add_argument_group('gyroscope on /imu/data, 100 Hz')
     gyro.add_argument('--gyro', action='store_true', help='with a gyroscope')
-    gyro.add_argument('--gyro-noise', dest='gyro.sigma,bias,bias_walk', metavar='WHITE,BIAS,WALK',
-                      type=_numbers(0, 1, 2), help='white noise [rad/sqrt(s)], bias at the '
-                      'start [rad/s] and its walk [rad/s/sqrt(s)]; implies --gyro (default: '
-                      '5e-4,0.01,2e-5)')
     fixes = parser.add_argument_group('GNSS on /gps/fix')
     fixes.add_argument('--fix', action=argparse.BooleanOptionalAction,
                        help='with fixes (default: in the drive; the options below imply it)')
@@ -125,21 +121,16 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
     fixes.add_argument('--fix-sigma', dest='fixes.white', metavar='M', type=number(0.0),
                        help='white error of a coordinate (default: 0.4)')
     fixes.add_argument('--fix-correlated', dest='fixes.correlated,correlation_s', metavar='M,S',
-                       type=_numbers(0, 1), help='standard deviation and time constant '
-                       'of the correlated (Gauss-Markov) error of a coordinate; 0,1 for none '
-                       '(default: 1.2,60)')
+                       type=_pair, help='standard deviation and time constant of the correlated '
+                       '(Gauss-Markov) error of a coordinate; 0,1 for none (default: 1.2,60)')
     poses = parser.add_argument_group('global poses on /global_pose')
     poses.add_argument('--global-pose', dest='poses.period_s', metavar='PERIOD', type=number(0.01),
                        help='a pose in the map every so many seconds (default: there are none)')
-    poses.add_argument('--global-pose-sigma', dest='poses.sigmas', metavar='M,RAD', type=_numbers(
-        0, 0, 1), help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
     loops.add_argument('--closures', dest='closures.rate', metavar='RATE', type=number(0.0, 1.0),
                        help='share of the stretches driven before in which a closure is found, 0 '
                        'to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
                        '(default: 1; grid: 0.5)')
-    loops.add_argument('--closure-sigma', dest='closures.sigmas', metavar='M,RAD', type=_numbers(
-        0, 0, 1), help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
     loops.add_argument('--false-rate', metavar='SHARE', type=number(0.0),
                        help='share of all closures that tie two different places '
                             '(default: 0; drive: 4 single ones and a group of 4)')
@@ -191,20 +182,16 @@ def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
         raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
 
 
-def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads numbers with commas between them, and gives them in an order."""
-    count = max(order) + 1
-
-    def read(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(map(float, text.split(',')))
-        except ValueError:
-            values = ()
-        if len(values) != count or not all(map(math.isfinite, values)):
-            raise argparse.ArgumentTypeError(
-                f'expected {count} numbers with commas between them, got {text!r}')
-        return tuple(values[k] for k in order)
-    return read
+def _pair(text: str) -> tuple[float, ...]:
+    """Return two numbers with a comma between them."""
+    try:
+        values = tuple(map(float, text.split(',')))
+    except ValueError:
+        values = ()
+    if len(values) != 2 or not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(
+            f'expected 2 numbers with commas between them, got {text!r}')
+    return values
 
 
 def _groups(text: str) -> tuple[int, int]:

@@ -49,9 +49,8 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a bag with everything that can be in one."""
     folder = tmp_path_factory.mktemp('disturbed') / 'bag'
     simulate(folder, '--world', 'hall', '--duration', '240', *ALL, '--false-groups', '1:3',
-             '--false-rate', '0.25', '--odometry', 'model', '--gyro-noise', '1e-3,0.02,1e-5',
+             '--false-rate', '0.25', '--odometry', 'model',
              '--fix-sigma', '0.2', '--fix-correlated', '0.5,20', '--fix-period', '1',
-             '--global-pose-sigma', '0.2,0.03', '--closure-sigma', '0.1,0.02',
              '--outage', '/gps/fix:100:130', '--outage', '/global_pose:50:200',
              '--jump', '/odom:150:2,0,0.1', '--jump', '/gps/fix:200:9,9:20',
              '--delay', '/gps/fix:1.5:2.5', '--delay', '/loop_closure:3',
@@ -82,8 +81,8 @@ def test_the_bag_has_what_was_asked_for(disturbed) -> None:
                 sigmas['rate'] = message.angular_velocity_covariance[8]**0.5
     assert dict(counts) == truth['topics']
     assert sigmas == pytest.approx({
-        'fix': 0.5 * np.hypot(0.2, 0.5), 'pose': 0.2, 'heading': 0.03, 'closure': 0.1,
-        'rate': 1e-2})
+        'fix': 0.5 * np.hypot(0.2, 0.5), 'pose': 0.1, 'heading': 0.02, 'closure': 0.05,
+        'rate': 5e-3})
     assert late['/odom'] == pytest.approx([0.004] * counts['/odom'])
     assert late['/imu/data'] == pytest.approx([0.002 - 0.02] * counts['/imu/data'])
     assert 1.5 <= min(late['/gps/fix']) < max(late['/gps/fix']) <= 4.0
