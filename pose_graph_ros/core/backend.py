@@ -54,9 +54,8 @@ class PoseGraphBackend:
 
     """
 
-    def __init__(
-        self, config: BackendConfig | None = None, smoother: IncrementalSmoother | None = None,
-    ) -> None:
+    def __init__(self, config: BackendConfig | None = None,
+                 smoother: IncrementalSmoother | None = None) -> None:
         self._config = config or BackendConfig()
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self.graph = self._smoother.graph  # which only this object may change

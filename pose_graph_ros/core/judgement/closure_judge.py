@@ -34,9 +34,8 @@ from pose_graph_ros.core.sources.queued import Queued
 
 
 class ClosureJudge:
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, chain: OdometryChain,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting,
+                 chain: OdometryChain) -> None:
         self._smoother, self._reweighting, self._chain = smoother, reweighting, chain
         self.states = cl.ClosureTable(chain)
         self.redecision = Redecision(smoother)

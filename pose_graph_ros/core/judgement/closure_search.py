@@ -136,10 +136,8 @@ class _Gates:
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 
 
-def best(
-    problem: TruncatedProblem, inside: BoolArray | None = None, present: FloatArray | None = None,
-    gain: float = 0.0,
-) -> Choosing:
+def best(problem: TruncatedProblem, inside: BoolArray | None = None,
+         present: FloatArray | None = None, gain: float = 0.0) -> Choosing:
     """
     Return the set with the lowest truncated cost; None if the graph cannot be solved.
 
@@ -195,10 +193,8 @@ def _completed(problem: TruncatedProblem, choice: Choice) -> Choosing:
 CONFIG = SolverConfig(max_iterations=100)
 
 
-def decide(
-    graph: Graph, ids: IntArray, forced: IntArray, inside: BoolArray,
-    losses: Reweighting | None = None,
-) -> Choosing:
+def decide(graph: Graph, ids: IntArray, forced: IntArray, inside: BoolArray,
+           losses: Reweighting | None = None) -> Choosing:
     """
     Return which loop closures to believe, with poses by row; None if the graph cannot be solved.
 
@@ -281,10 +277,8 @@ class Redecision:
         return (self.job is not None and self._solves) or (
             graph.n_nodes > BELIEF.small and graph.next_ids.node < self._next_solution)
 
-    def tried(
-        self, weights: Mapping[int, float], poses: FloatArray | None = None,
-        may_adopt: Callable[[], bool] = lambda: True,
-    ) -> Generator[None, None, bool]:
+    def tried(self, weights: Mapping[int, float], poses: FloatArray | None = None,
+              may_adopt: Callable[[], bool] = lambda: True) -> Generator[None, None, bool]:
         """Solve a copy with other weights; return whether the graph is that now."""
         trial = self._smoother.trial(GraphUpdate(weigh=weights), poses)
         while trial.work():

@@ -55,10 +55,8 @@ class SavedJudgement:
 class Judge:
     """Judges the constraints of a graph; it knows no clock, and nothing of how they arrived."""
 
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
-        factors: FactorBuilder,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
+                 factors: FactorBuilder) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._nodes, self._factors, self._chain = nodes, factors, OdometryChain()
         self.fixes = FixJudge(smoother, reweighting, nodes, factors, self._chain)

@@ -175,10 +175,8 @@ class Judgements:
         undo.callback(np.copyto, self.records, self.records.copy())
         undo.callback(setattr, self, '_changes', self._changes.copy())
 
-    def verdict(
-        self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
-        contradicted_by: Sequence[str],
-    ) -> vd.Verdict:
+    def verdict(self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
+                contradicted_by: Sequence[str]) -> vd.Verdict:
         record = self.records[row]
         stamp, reference = record['stamps_ns'].tolist()
         return vd.Verdict(

@@ -72,9 +72,8 @@ def integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
     return exp_one((x, y, theta))
 
 
-def step_variance(
-    source: OdometrySource, twist: Variances | None, step: tuple[float, float], elapsed: float,
-) -> Variances:
+def step_variance(source: OdometrySource, twist: Variances | None, step: tuple[float, float],
+                  elapsed: float) -> Variances:
     """
     Return the variance of (x, y, theta) of a short motion in the robot's frame, but its scale.
 
@@ -189,10 +188,8 @@ def as_calibrated(edges: Factors, nodes: FloatArray) -> Factors:
         edges.mean, -edges.constants[:, 3] * rate, 1.0 + scale))
 
 
-def changed(
-    means: FloatArray, informations: FloatArray, seconds: FloatArray, before: OdometryErrors,
-    after: OdometryErrors,
-) -> tuple[FloatArray, FloatArray]:
+def changed(means: FloatArray, informations: FloatArray, seconds: FloatArray,
+            before: OdometryErrors, after: OdometryErrors) -> tuple[FloatArray, FloatArray]:
     """Return means and informations of edges with other errors than those that they have."""
     claimed = before.inverse_noise.informations(informations)
     return (after.motions(before.as_odometry_says(means, seconds), seconds),
@@ -266,9 +263,8 @@ class SpeedWindow(NamedTuple):
         return SpeedWindow(speeds, stamp_ns, pose)
 
 
-def is_jump(
-    speeds: Speeds, step: tuple[float, float], elapsed: float, stated: float, limit: float,
-) -> bool:
+def is_jump(speeds: Speeds, step: tuple[float, float], elapsed: float, stated: float,
+            limit: float) -> bool:
     """
     Tell whether a step (length, absolute turn) is longer than the robot can have moved.
 

@@ -50,9 +50,8 @@ class ThinnedNodes:
     def __len__(self) -> int:
         return self._size
 
-    def add(
-        self, numbers: IntArray, anchors: IntArray, relative: Poses, noise: se2.Covariances,
-    ) -> None:
+    def add(self, numbers: IntArray, anchors: IntArray, relative: Poses,
+            noise: se2.Covariances) -> None:
         """Add nodes; none of the anchors is among these, or has left before."""
         if len(numbers) == 0:
             return

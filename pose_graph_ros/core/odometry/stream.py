@@ -384,10 +384,8 @@ class OdometryStream(ReorderBuffer[Received]):
                        jumped=False, twist=twist)
 
 
-def _elsewhere(
-    before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
-    speeds: mo.Speeds = mo.UNKNOWN, *, restarted: bool = False,
-) -> Instant:
+def _elsewhere(before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
+               speeds: mo.Speeds = mo.UNKNOWN, *, restarted: bool = False) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
@@ -395,10 +393,8 @@ def _elsewhere(
                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
-def find_silence(
-    streams: Mapping[str, OdometryStream], names: Sequence[str], last_ns: int,
-    settled: tuple[str, int], patience_ns: int,
-) -> tuple[int, int] | None:
+def find_silence(streams: Mapping[str, OdometryStream], names: Sequence[str], last_ns: int,
+                 settled: tuple[str, int], patience_ns: int) -> tuple[int, int] | None:
     """
     Return the first silence of the primary source that is longer than the patience, if any.
 

@@ -223,9 +223,8 @@ class FactorBuilder:
             return state.errors
         return _given(self._settings(source))
 
-    def set_errors(
-        self, source: str, errors: bs.CorrelatedErrors | None, bias: bs.BiasChain | None,
-    ) -> None:
+    def set_errors(self, source: str, errors: bs.CorrelatedErrors | None,
+                   bias: bs.BiasChain | None) -> None:
         """Treat the measurements of a source with other errors, whose bias is in the graph."""
         state = self.sources[source]
         self.abandon(state.bias)
@@ -248,9 +247,8 @@ class FactorBuilder:
         return {source: float(graph.poses_of(node)[0])
                 for source, node in self._newest_states(graph, 1).items()}
 
-    def calibrations(
-        self, graph: Graph, covariance: Callable[[int], Covariance],
-    ) -> dict[str, bs.Calibration]:
+    def calibrations(self, graph: Graph,
+                     covariance: Callable[[int], Covariance]) -> dict[str, bs.Calibration]:
         """Return what each odometry is calibrated by, given covariances of nodes."""
         found = dict[str, bs.Calibration]()
         if graph.has_touched:
@@ -284,9 +282,8 @@ class FactorBuilder:
         return {source: (state.measured['stamp_ns'], state.held())
                 for source, state in self.sources.items() if self.has(source)}
 
-    def leaving_biases(
-        self, factors: IntArray, others: Mapping[str, bs.BiasChain], graph: Graph,
-    ) -> list[int]:
+    def leaving_biases(self, factors: IntArray, others: Mapping[str, bs.BiasChain],
+                       graph: Graph) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
         ends = graph.factor_records['ends'][~np.isin(graph.factor_ids, factors), 2]

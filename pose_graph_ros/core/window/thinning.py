@@ -106,9 +106,8 @@ def _near(graph: Graph, poses: IntArray) -> dict[int, set[int]]:
     return neighbours(poses, ends[used])
 
 
-def crowded(
-    poses: Poses, preferred: BoolArray, config: ThinningConfig, part: int = LIMITS.compared,
-) -> IntArray:
+def crowded(poses: Poses, preferred: BoolArray, config: ThinningConfig,
+            part: int = LIMITS.compared) -> IntArray:
     """
     Return rows of poses that leave, ascending, each with that of its anchor, shape (L, 2).
     """
@@ -178,10 +177,8 @@ class Thinning:
         # with about one for each node that comes before the next look
         return n_measured + LIMITS.every > LIMITS.measurements * self._n_stay
 
-    def places(
-        self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int, keep: IntArray,
-        first: int,
-    ) -> Places | None:
+    def places(self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int,
+               keep: IntArray, first: int) -> Places | None:
         """
         Return the nodes from a first one on that leave now, maybe none; None most times.
 
@@ -218,9 +215,8 @@ def groups(graph: Graph, places: Places) -> Iterator[Places]:
         places = places.rows(~inside)
 
 
-def certain(
-    smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray, config: ThinningConfig,
-) -> Places:
+def certain(smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray,
+            config: ThinningConfig) -> Places:
     """
     Return the places of those nodes which are beside their anchors for sure.
 
