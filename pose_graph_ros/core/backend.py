@@ -171,6 +171,7 @@ class PoseGraphBackend:
             first = self.graph.next_ids.node
             self._smoother.update(GraphUpdate(hidden=made.mean[None], fix=(first,)))
             return first
+        chain = None
         if made.moving > 0.0:
             change, chain = self._factors.next_node(made, self.graph)
             result = self._smoother.update(change)
@@ -180,13 +181,10 @@ class PoseGraphBackend:
             # the next sample tries again, with a longer motion
             self.counts['solver', 'failed'] += 1
             return -1
-        if made.moving > 0.0:
+        if chain is not None:
             self._factors.keep(made.source, chain)
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
-        settings = self._config.odometry_source(made.source)
-        edge = self.graph.next_ids.factor - 1
-        self._reweighting.add(edge, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: ms.Measurement, source: str) -> ms.Answer:

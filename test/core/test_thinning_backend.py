@@ -113,8 +113,8 @@ def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_
     for number in thinned['numbers'].tolist():
         place = backend._nodes.thinned.place(number)
         assert place is not None
-        assert np.max(np.abs(place.mean[:2])) < 4.0
-        assert 0.0 < np.trace(place.noise[:2, :2]) < 1.0
+        assert np.max(np.abs(place[1].mean[:2])) < 4.0
+        assert 0.0 < np.trace(place[1].covariance[:2, :2]) < 1.0
 
 
 def test_fixes_with_correlated_errors_leave_with_their_biases() -> None:

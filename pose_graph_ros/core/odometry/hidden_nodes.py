@@ -162,7 +162,7 @@ class HiddenNodes(NodeTable):
         """Make a source the primary one, and the first node at its first sample."""
         stream = self.streams[source]
         first_ns = stream.first_after(-1)
-        stream.settle_all(first_ns)
+        list(stream.settle(first_ns))
         pose = stream.timeline.poses[0]
         self._set_primary(-1, source)
         self.covered_ns = self._base_ns = first_ns
@@ -187,7 +187,7 @@ class HiddenNodes(NodeTable):
             self._extend(stamp_ns, pose)
         source = self._first_with_sample(others, last_ns, known_ns)
         stream = self.streams[source]
-        stream.settle_all(known_ns)
+        list(stream.settle(known_ns))
         self._add_secondary_edges()
         timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
         self._set_primary(last_ns, source)

@@ -3,7 +3,7 @@
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -15,15 +15,6 @@ from pose_graph_ros.core.odometry.motion import Attachment, Span
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Records, Rows3
-
-
-class Place(NamedTuple):
-    """Where a node is relative to another one."""
-
-    anchor: int  # number of the node that stands for it
-    mean: se2.PoseVector  # pose in the anchor
-    noise: se2.Covariance  # of that pose, in the frame of the node
-
 
 # Nodes that have left although older ones stay: their numbers, ascending, those of nodes beside
 # them, their poses in these, and the upper triangles of the covariances of these poses, in the
@@ -72,13 +63,13 @@ class ThinnedNodes:
         table['relative'][passed], table['noise'][passed] = both.mean, upper(both.covariance)
         table['anchors'][passed] = before['anchors']
 
-    def place(self, number: int) -> Place | None:
-        """Return the place of a node; None if it is not among these."""
+    def place(self, number: int) -> tuple[int, Span] | None:
+        """Return the anchor of a node, by number, and the motion from there; None without."""
         row = number - self._first
         if not 0 <= row < len(self._rows) or self._rows['anchors'][row] < 0:
             return None
         anchor, mean, noise = self._rows.values[row]
-        return Place(int(anchor), mean.astype(float), full(noise[None].astype(float))[0])
+        return int(anchor), Span(mean.astype(float), full(noise[None].astype(float))[0])
 
     def places(self) -> GrowingArray:
         """Return the places of all nodes, records of `PLACES`."""
@@ -212,11 +203,9 @@ class NodeTable:
 
     def attachment(self, number: int, mean: se2.PoseVector, noise: se2.Covariance) -> Attachment:
         """Return the attachment of a motion from a node, or from the one that stands for it."""
-        place = self.thinned.place(number)
-        if place is None:
-            return Attachment(int(self.ids[number]), mean, noise)
-        return Attachment(
-            int(self.ids[place.anchor]), *Span(place.mean, place.noise).continued(mean, noise))
+        if (place := self.thinned.place(number)) is not None:
+            number, (mean, noise) = place[0], place[1].continued(mean, noise)
+        return Attachment(int(self.ids[number]), mean, noise)
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""

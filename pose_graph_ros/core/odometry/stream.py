@@ -230,11 +230,6 @@ class OdometryStream(ReorderBuffer[Received]):
             self.timeline.append(self._last.row)
             yield self._last.row.stamp_ns, self._last.row.pose
 
-    def settle_all(self, until_ns: int) -> None:
-        """Settle all samples up to a stamp [ns]."""
-        for _ in self.settle(until_ns):
-            pass
-
     def forget(self, before_ns: int) -> None:
         """Drop settled samples that motions from an instant [ns] on do not depend on."""
         self.timeline.drop_before(min(before_ns, self.settled_ns - mo.SPEED_TIME_NS))
@@ -335,11 +330,7 @@ class OdometryStream(ReorderBuffer[Received]):
         ends = OdometryTimeline(rows[after - 1:after + 1])
         if not ends.covers(stamp_ns, closely=True):
             return None
-        first = self.timeline.motion_to(since_ns, rows[after - 1].numbers)
-        last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
-        return mo.Motion(
-            se2.compose(first.increment, last.increment), first.distance + last.distance,
-            first.turn + last.turn, first.variance + last.variance)
+        return self.timeline.motion_to(since_ns, *ends.at(stamp_ns))
 
     def _follow(self, begin: int = 0) -> None:
         """Compute the states at the samples that are not settled, from one on."""

@@ -148,10 +148,11 @@ def test_places_are_passed_on_from_anchor_to_anchor(seed: int) -> None:
         mean, C = np.zeros(3), np.zeros((3, 3))
         for _, step, noise_ in reversed(chain):
             mean, C = se2.compose(mean, step), at_the_end(mean, C, step, noise_)
-        assert place.anchor == chain[-1][0]
+        anchor, span = place
+        assert anchor == chain[-1][0]
         np.testing.assert_allclose(
-            se2.between(place.mean, mean), 0.0, atol=1e-5)   # single precision
-        np.testing.assert_allclose(place.noise, C, rtol=1e-5, atol=1e-4 * np.max(np.abs(C)))
+            se2.between(span.mean, mean), 0.0, atol=1e-5)   # single precision
+        np.testing.assert_allclose(span.covariance, C, rtol=1e-5, atol=1e-4 * np.max(np.abs(C)))
 
 
 def at_the_end(
