@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.batch.truncated import LIMITS
-from pose_graph_ros.core.compiled.jit import kernel, MATRICES, NUMBERS, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
@@ -97,24 +96,8 @@ def forward(edges: Factors) -> Factors:
 
 def squares(errors: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return squared Mahalanobis distances of errors, shape (M,)."""
-    out = np.empty(len(errors))
-    _write_squares(np.ascontiguousarray(errors), np.ascontiguousarray(covariances), out)
-    return out
-
-
-@kernel(signature=(ROWS, MATRICES, NUMBERS))
-def _write_squares(errors, covariances, out):  # type: ignore[no-untyped-def]
-    for k in range(len(errors)):
-        m, e = covariances[k], errors[k]
-        # m = L L^T, and L^-1 e
-        l00 = math.sqrt(m[0, 0])
-        l10, l20 = m[1, 0] / l00, m[2, 0] / l00
-        l11 = math.sqrt(m[1, 1] - l10 * l10)
-        l21 = (m[2, 1] - l20 * l10) / l11
-        x = e[0] / l00
-        y = (e[1] - l10 * x) / l11
-        z = e[2] - l20 * x - l21 * y
-        out[k] = x * x + y * y + z * z / (m[2, 2] - l20 * l20 - l21 * l21)
+    return np.einsum(
+        'mi,mi->m', errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
 
 
 def as_edges(some: Closures) -> Factors:
