@@ -161,9 +161,8 @@ def best(problem: TruncatedProblem, inside: BoolArray | None = None,
     # the surest ones have led to a minimum that is better than that from odometry
     found = odometry if surest is None else problem.graph.poses.copy()
     choices = list[tuple[float, Choice]]()
-    for believed, start, less in (
-            (inside if is_sparse else None, present, gain), (surest, found, 0.0),
-            (~everything, found, 0.0)):
+    for believed, start, less in ((inside if is_sparse else None, present, gain),
+                                  (surest, found, 0.0), (~everything, found, 0.0)):
         problem.begin_at(start)
         choice = None if believed is None else (yield from problem.choice(believed))
         if choice is not None:

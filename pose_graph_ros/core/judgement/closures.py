@@ -125,21 +125,17 @@ def chances(covariance: FloatArray, extent: FloatArray) -> FloatArray:
 
 
 class ClosureTable(Judgements):
-    i, j, mean, noise = Column(), Column(), Column(), Column()
-    spread, travel = Column(), Column()
-    forgotten, round, resting = Column(), Column(), Column()
+    KIND = vd.Judged.LOOP_CLOSURE
+    i, j = Column(np.int64), Column(np.int64)   # as in `Closures`
+    mean, noise = Column(np.float64, 3), Column(np.float64, 3, 3)
+    spread = Column(np.float64, 3, 3)  # of the prediction when it was tested last
+    travel = Column(np.float64, 2)  # way along the path to both ends [m]
+    forgotten = Column(np.bool_)  # hopeless, and not judged again
+    round = Column(np.int64, new=NEVER)  # of its last test
+    resting = Column(np.int64)  # id of the node until which it is not tested
 
     def __init__(self, chain: OdometryChain) -> None:
-        super().__init__(
-            vd.Judged.LOOP_CLOSURE, [
-                ('i', np.int64), ('j', np.int64), ('mean', np.float64, (3,)),   # as in `Closures`
-                ('noise', np.float64, (3, 3)),
-                ('spread', np.float64, (3, 3)),  # of the prediction when it was tested last
-                ('travel', np.float64, (2,)),  # way along the path to both ends [m]
-                ('forgotten', np.bool_),  # hopeless, and not judged again
-                ('round', np.int64),  # of its last test
-                ('resting', np.int64)],  # id of the node until which it is not tested
-            round=NEVER)
+        super().__init__()
         self.chain = chain
         # numbers by the way to the later end, and these ways; none after a change
         self._by_end: tuple[IntArray, FloatArray] | None = None
@@ -239,7 +235,6 @@ class ClosureTable(Judgements):
                             if vd.USED[self.state[other]]]
             if self.distance[number] > math.sqrt(GATE):
                 contradicted.insert(0, vd.ODOMETRY)
-            verdicts.append(self.verdict(
-                number, residual, supported_by=around[agrees].tolist(),
-                contradicted_by=contradicted))
+            verdicts.append(self.verdict(number, residual, contradicted_by=contradicted,
+                                         supported_by=around[agrees].tolist()))
         return verdicts

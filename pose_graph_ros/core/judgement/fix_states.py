@@ -32,11 +32,8 @@ ALIKE_WITHIN = 50
 
 
 class FixStates(Judgements):
-    run = Column()
-
-    def __init__(self) -> None:
-        # id of the first one of its fault, `LONE` or `GOOD`
-        super().__init__(vd.Judged.FIX, [('run', np.int64)], run=LONE)
+    KIND = vd.Judged.FIX
+    run = Column(np.int64, new=LONE)  # id of the first one of its fault, `LONE` or `GOOD`
 
     @property
     def believed(self) -> BoolArray:

@@ -237,9 +237,8 @@ class Judge:
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
         nodes, known = self._chain.nodes, self._nodes
-        self._chain.correct(
-            before, after, known.stamps_ns[np.searchsorted(known.ids, nodes)],
-            ~np.isin(nodes[1:], known.relocated_ids))
+        stamps_ns = known.stamps_ns[np.searchsorted(known.ids, nodes)]
+        self._chain.correct(before, after, stamps_ns, ~np.isin(nodes[1:], known.relocated_ids))
 
     def finish(self, undo: ExitStack[bool]) -> None:
         """

@@ -170,9 +170,8 @@ def as_edge(prior: Prior) -> Factors:
     information = _semidefinite(prior.information[at, at])
     delta = np.zeros((2, 3))
     delta[second] = _pseudo_inverse(information) @ prior.vector[at]
-    return edges_between(
-        prior.nodes, (prior.reference, delta), np.array([first]), np.array([second]),
-        information[None])
+    return edges_between(prior.nodes, (prior.reference, delta), np.array([first]),
+                         np.array([second]), information[None])
 
 
 def as_observed(prior: Prior) -> Factors:

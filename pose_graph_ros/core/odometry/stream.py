@@ -310,11 +310,10 @@ class OdometryStream(ReorderBuffer[Received]):
         Return the motion from a settled instant [ns] to the newest sample, settled or not.
 
         With it comes the pose of that sample as received, shape (3,) [m, m, rad]. Raises
-        ValueError if there are no samples, or they do not cover the instant.
+        ValueError if the samples do not cover the instant.
         """
         last = self._ahead[-1] if self._ahead else self._last
-        if last is None:
-            raise ValueError('there is no odometry')
+        assert last is not None, 'the primary source has samples'
         return self.timeline.motion_to(since_ns, last.row.numbers), np.array(last.raw)
 
     def motion_ahead(self, since_ns: int, stamp_ns: int) -> mo.Motion | None:

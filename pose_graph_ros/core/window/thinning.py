@@ -41,9 +41,8 @@ class Segment(NamedTuple):
 def carriers(graph: Graph) -> IntArray:
     """Return the pose, by id, that holds each factor as a measurement; -1 if it is none."""
     factors, is_pose = graph.factors, graph.is_pose
-    measures = is_pose[graph.node_rows(factors.i)] & (
-        (factors.kind == FactorKind.BIAS)
-        | ((factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
+    measures = is_pose[graph.node_rows(factors.i)] & ((factors.kind == FactorKind.BIAS) | (
+        (factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
     # a rotation, and odometry that is calibrated, is held by the later one of its poses
     return np.where(measures, factors.i, np.where(
         factors.k >= 0, np.maximum(factors.i, factors.j), -1))
