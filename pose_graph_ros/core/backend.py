@@ -366,7 +366,7 @@ class PoseGraphBackend:
             self._settle()  # what is believed again
             optimized = self._optimize_whole()
             tr.checked(optimized)
-        return report.after(replace(optimized, reason=transaction.failure))
+        return report.after(optimized._replace(reason=transaction.failure))
 
     def _optimize_whole(self) -> UpdateReport:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""

@@ -10,7 +10,6 @@ takes about log2 n attempts, and all halves that pass are added on the way.
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any, TypeVar
 
 from pose_graph_ros.core.batch.optimizer import Status
@@ -107,8 +106,8 @@ def update_isolated(add_queue: Update, parts: Parts) -> tuple[UpdateReport, list
     reasons = [f'{queued(one, parts)[0]}: {reason}' for one, reason in bad[:5]] or [report.reason]
     if len(bad) > 5:
         reasons.append(f'and {len(bad) - 5} more')
-    return replace(added[-1], status=Status.FAILED, reason='; '.join(reasons),
-                   new_constraints=sum(each.new_constraints for each in added)), untried
+    return added[-1]._replace(status=Status.FAILED, reason='; '.join(reasons), new_constraints=sum(
+        each.new_constraints for each in added)), untried
 
 
 def update_with_all(update: Update, parts: Parts) -> UpdateReport:

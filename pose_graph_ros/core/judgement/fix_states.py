@@ -10,7 +10,6 @@ and keeps the weights. Here it is told which odometry is doubted.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple
 
@@ -179,8 +178,8 @@ class OdometryStates:
             edges = graph.factors_at(np.array(doubt.edges))
             begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
             chi2 = np.sum(energies(graph.errors(edges), edges.information))
-            verdicts.append(replace(
-                doubt.verdict, distance=float(np.sqrt(chi2)), residual=se2.between(
+            verdicts.append(doubt.verdict._replace(
+                distance=float(np.sqrt(chi2)), residual=se2.between(
                     reduce(se2.compose, edges.mean), se2.between(begin, end)),
                 contradicted_by=fixes.believed_after(doubt.verdict.stamp_ns)))
         return verdicts

@@ -12,7 +12,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,7 @@ from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.queued import Queued
 
 
-@dataclass(frozen=True, slots=True)
-class SavedJudgement:
+class SavedJudgement(NamedTuple):
     closures: SavedVerdicts
     fixes: SavedVerdicts
     loosened: Integers  # ids of odometry edges that are believed less than claimed
@@ -49,7 +48,7 @@ class SavedJudgement:
     # number of odometry edges of some sources that have left the graph doubted
     odometry_left: Mapping[str, int]
     # pose and covariance of the hypotheses on fixes, see `Spread`; empty in older files
-    spread: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    spread: Rows3 = np.empty((0, 3))
 
 
 class Judge:
@@ -210,7 +209,7 @@ class Judge:
         unused += fixes.verdicts(graph, leaving[-MOST_OTHERS:])
         unused += [each for each in self._odometry.verdicts(graph, fixes)
                    if each.number in factors]
-        return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
+        return [each._replace(left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
     def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[vd.Verdict]) -> None:
         self._chain.forget(nodes)

@@ -9,8 +9,7 @@ Loop closures have one, positions and poses in the map another.
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +30,7 @@ MOST_OTHERS = 500
 Records = npt.NDArray[Any]
 
 
-@dataclass(frozen=True, slots=True)
-class SavedVerdicts:
+class SavedVerdicts(NamedTuple):
     """The columns of a table, and its sources."""
 
     sources: tuple[str, ...]

@@ -10,7 +10,6 @@ the yaw rate and of the scale that stay the same are taken out of the motion its
 done to edges with any errors in use, and undone, without loss.
 """
 
-from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
@@ -56,8 +55,7 @@ class Span(NamedTuple):
 NO_MOTION = Motion(np.zeros(3), 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(NamedTuple):
     """An instant, given by the last hidden node before it and the motion since."""
 
     node: int  # id of the node in the graph

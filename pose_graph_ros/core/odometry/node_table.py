@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
-from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -91,8 +90,7 @@ class ThinnedNodes:
         self._first = number
 
 
-@dataclass(frozen=True, slots=True)
-class SavedNodes:
+class SavedNodes(NamedTuple):
     """Saved hidden nodes, and the state of the odometry sources."""
 
     stamps_ns: Integers
@@ -107,15 +105,14 @@ class SavedNodes:
     bridge: Span | None
     streams: dict[str, SavedStream]  # by the name of the source
     # poses of the first nodes, which have left the graph
-    frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    frozen: Rows3 = np.empty((0, 3))
     travelled: float = 0.0  # path length up to the first node in the graph [m]
-    thinned: Annotated[GrowingArray, Records(PLACES)] = field(
-        default_factory=lambda: GrowingArray((), PLACES))
+    thinned: Annotated[GrowingArray, Records(PLACES)] = GrowingArray((), PLACES)
     # `OdometryErrors` that the edges know of; empty in files of older versions, in which weights
     # of the edges stand for them
-    errors: Numbers = field(default_factory=lambda: np.empty(0))
+    errors: Numbers = np.empty(0)
     # numbers of the nodes at which the robot was put by hand; empty in older files
-    relocated: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    relocated: Integers = np.empty(0, np.int64)
 
     def poses(self, node_ids: IntArray, poses: Poses) -> Poses:
         """Return the poses of all nodes."""

@@ -4,7 +4,7 @@
 
 import bisect
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 import operator
 from typing import Generic, NamedTuple, TypeVar
@@ -127,8 +127,7 @@ class Instant(NamedTuple):
     twist: Pose = NO_TWIST  # as `Received.twist`
 
 
-@dataclass(frozen=True, slots=True)
-class SavedStream:
+class SavedStream(NamedTuple):
     """Saved odometry source: its samples next to the hidden nodes, and its newest ones."""
 
     stamps_ns: Integers  # stamps of settled samples, shape (T,) [ns]

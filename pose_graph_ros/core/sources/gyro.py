@@ -21,7 +21,7 @@ that both claim.
 import bisect
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -180,8 +180,7 @@ def turn(source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[flo
     return queued
 
 
-@dataclass(frozen=True, slots=True)
-class SavedGyro:
+class SavedGyro(NamedTuple):
     """Saved state of a gyroscope."""
 
     rates: tuple[YawRate, ...]  # from the last node on that was reached

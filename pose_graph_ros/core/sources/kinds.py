@@ -9,8 +9,7 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 import zlib
 
 import numpy as np
@@ -26,8 +25,7 @@ from pose_graph_ros.core.sources import validation
 from pose_graph_ros.core.sources.queued import Queued
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasurementKind:
+class MeasurementKind(NamedTuple):
     """
     What the engine asks of a kind of measurements.
 

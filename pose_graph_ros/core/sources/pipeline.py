@@ -7,7 +7,6 @@ import bisect
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,8 +29,7 @@ class WaitingMeasurement(NamedTuple):
     measurement: ms.PoseMeasurement
 
 
-@dataclass(frozen=True, slots=True)
-class SavedStamps:
+class SavedStamps(NamedTuple):
     """Stamps of the measurements of a source that were seen [ns], ascending, and references."""
 
     stamps_ns: Integers

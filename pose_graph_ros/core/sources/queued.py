@@ -4,7 +4,6 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -69,8 +68,7 @@ class Queued(NamedTuple):
         return len(self.nodes) == 0 or int(self.factor.kind[0]) == FactorKind.TURN
 
 
-@dataclass(frozen=True, slots=True)
-class SavedQueue:
+class SavedQueue(NamedTuple):
     """The columns of a queue."""
 
     sources: tuple[str, ...]
