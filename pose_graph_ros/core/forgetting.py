@@ -222,7 +222,7 @@ class Forgetting:
         leaving, judged = self._ask(leaving, sr.NONE, measured=True)
         parts.smoother.linearize(leaving)
         # anchors of thinned nodes that leave have a place in others
-        poses, thinned = nodes.recent_poses(graph), nodes.thinned.places()
+        poses, thinned = nodes.recent_poses(graph), nodes.places()
         anchors, numbers = thinned['anchors'], thinned['numbers']
         leave = np.unique(anchors[(anchors < first) & (numbers >= first)])
         kept = np.setdiff1d(np.arange(first, len(nodes)), numbers)

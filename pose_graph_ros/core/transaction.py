@@ -139,23 +139,21 @@ def isolate(
 
     `attempt` adds all constraints of a queue, or none; it returns why it cannot, or ''.
     """
-    bad: list[tuple[list[Queued], str]] = []
-    suspects, attempts = failed, 0
-    untried: list[Queued] = []
+    bad, untried, suspects, attempts = [], list[Queued](), failed, 0
+    why: str | None = reason    # '' if one of them has to be bad, None if nothing is known of them
     while True:
-        while len(suspects) > 1:
-            if attempts >= MOST_ATTEMPTS:
-                return bad, suspects + untried
-            half, rest = suspects[:len(suspects) // 2], suspects[len(suspects) // 2:]
-            attempts, reason = attempts + 1, attempt(half)
-            suspects, untried = ((rest, untried) if reason == '' else (half, rest + untried))
-        if reason == '':    # suspected because all others were added
-            attempts, reason = attempts + 1, attempt(suspects)
-        if reason != '':
-            bad.append((suspects, reason))
-        if len(untried) == 0 or attempts >= MOST_ATTEMPTS:
-            return bad, untried
-        attempts, reason = attempts + 1, attempt(untried)
-        if reason == '':
-            return bad, []
-        suspects, untried = untried, []
+        if why and len(suspects) == 1:
+            bad.append((suspects, why))
+            suspects, untried, why = untried, [], None
+        if len(suspects) == 0 or attempts == MOST_ATTEMPTS:
+            return bad, suspects + untried
+        # one alone is suspected because all others were added
+        whole = why is None or len(suspects) == 1
+        n = len(suspects) if whole else len(suspects) // 2
+        attempts, found = attempts + 1, attempt(suspects[:n])
+        if found != '':
+            suspects, untried, why = suspects[:n], suspects[n:] + untried, found
+        elif whole:
+            suspects, untried, why = untried, [], None
+        else:
+            suspects, why = suspects[n:], ''

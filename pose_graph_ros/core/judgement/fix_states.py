@@ -188,7 +188,7 @@ class OdometryStates:
         counts = Counter[str]()
         for doubt in self._gaps.values():
             counts[doubt.verdict.source] += len(doubt.edges)
-        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + self._nodes.n_thinned
         return {source: vd.SourceVerdicts(
             {vd.State.BELIEVED: n - n_left - counts[source], vd.State.DOUBTED: counts[source]},
             doubting=False, n_left=n_left, n_left_unused=self.left[source])

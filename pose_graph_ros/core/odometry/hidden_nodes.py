@@ -339,7 +339,7 @@ class HiddenNodes(NodeTable):
 
         The motion from an older node is interpolated between that node and the next one.
         """
-        if len(self.thinned) == 0 or len(self) - newest <= self.n_frozen:
+        if self.n_thinned == 0 or len(self) - newest <= self.n_frozen:
             return
         since_ns = int(self.stamps_ns[-newest])
         for stream in self.streams.values():
@@ -383,7 +383,7 @@ class HiddenNodes(NodeTable):
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
-            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
+            self.frozen.copy(), float(self.travelled[0]), self.places(),
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
@@ -399,5 +399,5 @@ class HiddenNodes(NodeTable):
         self.relocated = {*saved.relocated.tolist()}
         if len(saved.errors) > 0:
             self.errors = OdometryErrors(*saved.errors.tolist())
-        if len(self.thinned) > 0:
+        if self.n_thinned > 0:
             self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])
