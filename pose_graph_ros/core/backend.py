@@ -268,7 +268,7 @@ class PoseGraphBackend:
         queue: list[Queued] = []
         T_map_graph, graph = None, self.graph
         with tr.Transaction() as transaction:
-            transaction.keep(self._alignment, 'state', 'sigma')
+            transaction.callback(self._alignment.load, self._alignment.saved())
             T_map_graph = self._alignment.find(graph, self._pipeline.queue)
             queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:

@@ -35,19 +35,14 @@ class Transaction(ExitStack[bool]):
     """
     Context manager that undoes what is done in it, the last first, if an exception ends it.
 
-    Who changes anything in it says how that is undone, with `callback` or `keep`; what can wait
-    until it has succeeded is done after it. It suppresses an `Exception`, and stores its message
-    in `failure`. The smoother rolls back its own changes, bit for bit.
+    Who changes anything in it says how that is undone, with `callback`; what can wait until it has
+    succeeded is done after it. It suppresses an `Exception`, and stores its message in `failure`.
+    The smoother rolls back its own changes, bit for bit.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.failure = ''  # why all was undone; empty if it was not
-
-    def keep(self, owner: object, *names: str) -> None:
-        """Have attributes of an owner be again what they are now, if it fails."""
-        for name in names:
-            self.callback(setattr, owner, name, getattr(owner, name))
 
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> bool:
         if error is None:
