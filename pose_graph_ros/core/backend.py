@@ -54,9 +54,8 @@ class PoseGraphBackend:
 
     """
 
-    def __init__(
-        self, config: BackendConfig | None = None, smoother: IncrementalSmoother | None = None,
-    ) -> None:
+    def __init__(self, config: BackendConfig | None = None,
+                 smoother: IncrementalSmoother | None = None) -> None:
         self._config = config or BackendConfig()
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self.graph = self._smoother.graph  # which only this object may change
@@ -172,6 +171,7 @@ class PoseGraphBackend:
             first = self.graph.next_ids.node
             self._smoother.update(GraphUpdate(hidden=made.mean[None], fix=(first,)))
             return first
+        chain = None
         if made.moving > 0.0:
             change, chain = self._factors.next_node(made, self.graph)
             result = self._smoother.update(change)
@@ -181,13 +181,10 @@ class PoseGraphBackend:
             # the next sample tries again, with a longer motion
             self.counts['solver', 'failed'] += 1
             return -1
-        if made.moving > 0.0:
+        if chain is not None:
             self._factors.keep(made.source, chain)
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
-        settings = self._config.odometry_source(made.source)
-        edge = self.graph.next_ids.factor - 1
-        self._reweighting.add(edge, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: ms.Measurement, source: str) -> ms.Answer:
@@ -271,7 +268,7 @@ class PoseGraphBackend:
         queue: list[Queued] = []
         T_map_graph, graph = None, self.graph
         with tr.Transaction() as transaction:
-            transaction.keep(self._alignment, 'state', 'sigma')
+            transaction.callback(self._alignment.load, self._alignment.saved())
             T_map_graph = self._alignment.find(graph, self._pipeline.queue)
             queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:
@@ -369,7 +366,7 @@ class PoseGraphBackend:
             self._settle()  # what is believed again
             optimized = self._optimize_whole()
             tr.checked(optimized)
-        return report.after(replace(optimized, reason=transaction.failure))
+        return report.after(optimized._replace(reason=transaction.failure))
 
     def _optimize_whole(self) -> UpdateReport:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""

@@ -153,11 +153,9 @@ class OdometrySource:
     # a sample that is older by stamp than the newest one by up to this is still used [s]
     reorder_window: float = 0.25
     maximum_speed: float = 60.0  # a faster motion counts as a jump of the odometry [m/s]
-    loss: Loss = Loss.NONE
-    rejection_threshold: float = 3.0  # threshold k of the loss [sigma]
 
     def __post_init__(self) -> None:
-        check(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold')
+        check(self, 'covariance_scale', 'maximum_speed')
         for name in ('calibration_sigma', 'calibration_walk'):
             if not all(0.0 < each < math.inf for each in getattr(self, name)):
                 raise ConfigError(f'{name}: expected positive ones, got {getattr(self, name)}')
@@ -404,11 +402,11 @@ class BackendConfig(Settings):
         smoother. Raises ConfigError if one of these differs; it names it with both values.
         """
         require_same(type(self).__name__, self, wanted, 'smoother')
-        for settings, names in (
-                ('odometry', ('noise_from', 'integrate', 'calibrate', 'calibration_sigma',
-                              'calibration_walk')),
-                ('gyros', ('sigma_bias', 'sigma_bias_walk', 'bias_period')),
-                ('measurements', ('correlation_time',))):
+        fixed = {'odometry': ('noise_from', 'integrate', 'calibrate', 'calibration_sigma',
+                              'calibration_walk'),
+                 'gyros': ('sigma_bias', 'sigma_bias_walk', 'bias_period'),
+                 'measurements': ('correlation_time',)}
+        for settings, names in fixed.items():
             present, later = getattr(self, settings), getattr(wanted, settings)
             for source in sorted({*present, *later}):
                 # of a source that is not configured, the defaults

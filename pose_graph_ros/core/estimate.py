@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Outputs of the engine, as immutable values, and their prediction to newer odometry."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
@@ -19,8 +19,7 @@ from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors, step
 from pose_graph_ros.core.odometry.timeline import JITTER_DISTANCE, JITTER_HEADING
 
 
-@dataclass(frozen=True, slots=True)
-class UpdateReport:
+class UpdateReport(NamedTuple):
     """Result of an update or of an optimisation."""
 
     status: Status
@@ -34,13 +33,13 @@ class UpdateReport:
 
     def before(self, again: 'UpdateReport') -> 'UpdateReport':
         """Return one report of this update and the one after it; only the last may have failed."""
-        return replace(again, new_constraints=self.new_constraints + again.new_constraints)
+        return again._replace(new_constraints=self.new_constraints + again.new_constraints)
 
     def after(self, solved: 'UpdateReport') -> 'UpdateReport':
         """Return one report of this update and the optimisation of the whole graph after it."""
         failed = next((part for part in (self, solved) if part.status is Status.FAILED), solved)
-        return replace(self, status=failed.status, reason=failed.reason,
-                       iterations=self.iterations + solved.iterations, chi2=solved.chi2)
+        return self._replace(status=failed.status, reason=failed.reason, chi2=solved.chi2,
+                             iterations=self.iterations + solved.iterations)
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,9 +102,8 @@ class Forgetting:
             last, first = nodes.poses(parts.graph)[nodes.n_frozen - 1:nodes.n_frozen + 1]
             self._joint = se2.between(last, first)
 
-    def _ask(
-        self, nodes: IntArray, factors: IntArray, *, measured: bool,
-    ) -> tuple[IntArray, list[Verdict]]:
+    def _ask(self, nodes: IntArray, factors: IntArray, *,
+             measured: bool) -> tuple[IntArray, list[Verdict]]:
         """
         Ask the owners of hidden nodes, and of further factors, what they must keep of them.
 
@@ -191,9 +190,8 @@ class Forgetting:
         free = np.all(there, axis=0) & ~np.isin(places.nodes, self._held())
         return th.certain(self._parts.smoother, places.nodes[free], places.anchors[free], config)
 
-    def _leave(
-        self, places: th.Places, factors: IntArray = sr.NONE, *, measured: bool = False,
-    ) -> bool:
+    def _leave(self, places: th.Places, factors: IntArray = sr.NONE, *,
+               measured: bool = False) -> bool:
         """Let nodes and further factors leave, few others in their place; tell if they did."""
         nodes, judged = self._ask(places.nodes, factors, measured=measured)
         gone = self._solve(sr.sparse_removal(self._parts.graph, nodes, factors))
@@ -224,7 +222,7 @@ class Forgetting:
         leaving, judged = self._ask(leaving, sr.NONE, measured=True)
         parts.smoother.linearize(leaving)
         # anchors of thinned nodes that leave have a place in others
-        poses, thinned = nodes.recent_poses(graph), nodes.thinned.places()
+        poses, thinned = nodes.recent_poses(graph), nodes.places()
         anchors, numbers = thinned['anchors'], thinned['numbers']
         leave = np.unique(anchors[(anchors < first) & (numbers >= first)])
         kept = np.setdiff1d(np.arange(first, len(nodes)), numbers)

@@ -146,7 +146,7 @@ def estimate(parts: Parts, cov: FloatArray, chi2: float, *, with_path: bool) -> 
         T_map_odom=se2.compose(newest, se2.inverse(odometry)), covariance=cov,
         alignment=state, chi2=chi2, alignment_sigma=(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
-        n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=len(nodes.thinned),
+        n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=nodes.n_thinned,
         n_priors=graph.n_priors, n_edges=graph.n_edges,
         n_observed=sum(len(each) + each.n_otherwise for each in factors.sources.values()),
         n_biases=int(np.count_nonzero(graph.is_bias)),
@@ -169,7 +169,7 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     found = np.full((len(of.path), 3, 3), np.nan)
     inside = np.flatnonzero(rows >= 0)
     found[inside] = covariances[rows[inside]]
-    for number, anchor, mean, noise in nodes.thinned.places().values:
+    for number, anchor, mean, noise in nodes.places().values:
         found[number] = covariance.propagated(
             of.path.poses[anchor], found[anchor], mean, full(noise[None])[0])
     if of.alignment is AlignmentState.UNALIGNED:

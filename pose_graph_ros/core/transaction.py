@@ -10,7 +10,6 @@ takes about log2 n attempts, and all halves that pass are added on the way.
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any, TypeVar
 
 from pose_graph_ros.core.batch.optimizer import Status
@@ -36,19 +35,14 @@ class Transaction(ExitStack[bool]):
     """
     Context manager that undoes what is done in it, the last first, if an exception ends it.
 
-    Who changes anything in it says how that is undone, with `callback` or `keep`; what can wait
-    until it has succeeded is done after it. It suppresses an `Exception`, and stores its message
-    in `failure`. The smoother rolls back its own changes, bit for bit.
+    Who changes anything in it says how that is undone, with `callback`; what can wait until it has
+    succeeded is done after it. It suppresses an `Exception`, and stores its message in `failure`.
+    The smoother rolls back its own changes, bit for bit.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.failure = ''  # why all was undone; empty if it was not
-
-    def keep(self, owner: object, *names: str) -> None:
-        """Have attributes of an owner be again what they are now, if it fails."""
-        for name in names:
-            self.callback(setattr, owner, name, getattr(owner, name))
 
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> bool:
         if error is None:
@@ -107,8 +101,8 @@ def update_isolated(add_queue: Update, parts: Parts) -> tuple[UpdateReport, list
     reasons = [f'{queued(one, parts)[0]}: {reason}' for one, reason in bad[:5]] or [report.reason]
     if len(bad) > 5:
         reasons.append(f'and {len(bad) - 5} more')
-    return replace(added[-1], status=Status.FAILED, reason='; '.join(reasons),
-                   new_constraints=sum(each.new_constraints for each in added)), untried
+    return added[-1]._replace(status=Status.FAILED, reason='; '.join(reasons), new_constraints=sum(
+        each.new_constraints for each in added)), untried
 
 
 def update_with_all(update: Update, parts: Parts) -> UpdateReport:
@@ -140,23 +134,21 @@ def isolate(
 
     `attempt` adds all constraints of a queue, or none; it returns why it cannot, or ''.
     """
-    bad: list[tuple[list[Queued], str]] = []
-    suspects, attempts = failed, 0
-    untried: list[Queued] = []
+    bad, untried, suspects, attempts = [], list[Queued](), failed, 0
+    why: str | None = reason    # '' if one of them has to be bad, None if nothing is known of them
     while True:
-        while len(suspects) > 1:
-            if attempts >= MOST_ATTEMPTS:
-                return bad, suspects + untried
-            half, rest = suspects[:len(suspects) // 2], suspects[len(suspects) // 2:]
-            attempts, reason = attempts + 1, attempt(half)
-            suspects, untried = ((rest, untried) if reason == '' else (half, rest + untried))
-        if reason == '':    # suspected because all others were added
-            attempts, reason = attempts + 1, attempt(suspects)
-        if reason != '':
-            bad.append((suspects, reason))
-        if len(untried) == 0 or attempts >= MOST_ATTEMPTS:
-            return bad, untried
-        attempts, reason = attempts + 1, attempt(untried)
-        if reason == '':
-            return bad, []
-        suspects, untried = untried, []
+        if why and len(suspects) == 1:
+            bad.append((suspects, why))
+            suspects, untried, why = untried, [], None
+        if len(suspects) == 0 or attempts == MOST_ATTEMPTS:
+            return bad, suspects + untried
+        # one alone is suspected because all others were added
+        whole = why is None or len(suspects) == 1
+        n = len(suspects) if whole else len(suspects) // 2
+        attempts, found = attempts + 1, attempt(suspects[:n])
+        if found != '':
+            suspects, untried, why = suspects[:n], suspects[n:] + untried, found
+        elif whole:
+            suspects, untried, why = untried, [], None
+        else:
+            suspects, why = suspects[n:], ''

@@ -236,7 +236,6 @@ class Worker:
         if (result.finished and self._report(None, 0) > 0) or self._refined > 1e-3:
             self._publish()
 
-
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
         """Do a job and answer it, unless the thread is to end."""
         if self._stopping:
@@ -350,10 +349,8 @@ class SetPoseInput:
         T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(named)
         if T_map_frame is None:
             return given
-        turn = np.eye(3)
-        turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
         return ms.GlobalPose(given.stamp_ns, se2.compose(T_map_frame, given.pose),
-                          turn @ given.covariance @ turn.T)
+                             covariance.turned(given.covariance, -float(T_map_frame[2])))
 
 
 def _tell(answer: ms.Answer, refused: str, done: str) -> None:

@@ -418,8 +418,8 @@ def test_a_saved_graph_that_is_not_aligned_is_aligned_by_what_has_waited() -> No
 def test_what_waits_for_days_takes_no_more_memory_than_what_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr('pose_graph_ros.core.alignment.SOURCES', replace(
-        SOURCES, most_unaligned=100))
+    monkeypatch.setattr('pose_graph_ros.core.alignment.SOURCES', SOURCES._replace(
+        most_unaligned=100))
     some = drive(0, 400, 1.0)
     xy = np.where(np.arange(400)[:, None] < 250, some.xy[0], some.xy)   # frozen at first
     driven = Driven(some)

@@ -360,7 +360,7 @@ def test_the_estimate_reaches_to_the_newest_odometry() -> None:
 
 
 def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=3))
+    monkeypatch.setattr(pipeline, 'SOURCES', SOURCES._replace(most_waiting=3))
     backend = PoseGraphBackend(prompt())
     answers = [feed(backend, position) for position in DRIVE.positions[:5]]
     assert [answer.status for answer in answers] == (

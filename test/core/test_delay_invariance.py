@@ -127,8 +127,7 @@ PLAIN = BackendConfig(
     odometry={'wheel': OdometrySource(), 'visual': OdometrySource()},
     measurements={'scan': MeasurementSource(), 'walls': MeasurementSource()})
 ROBUST = BackendConfig(
-    odometry={'wheel': OdometrySource(),
-              'visual': OdometrySource(loss=Loss.HUBER, rejection_threshold=1.5)},
+    odometry=PLAIN.odometry,
     measurements={'beacon': MeasurementSource(loss=Loss.CAUCHY),
                   'gps': MeasurementSource(loss=Loss.HUBER, rejection_threshold=1.5),
                   'scan': MeasurementSource(loss=Loss.CAUCHY), 'walls': MeasurementSource()})

@@ -118,7 +118,7 @@ def observed(backend: PoseGraphBackend) -> FloatArray:
 
 # --- What does not change ------------------------------------------------------------------------
 
-ROBUST = replace(with_odometry(loss=Loss.HUBER, reorder_window=0.35), measurements={
+ROBUST = replace(with_odometry(reorder_window=0.35), measurements={
     name: replace(source, loss=Loss.CAUCHY) for name, source in CONFIG.measurements.items()})
 TWIST = with_odometry(noise_from=NoiseFrom.TWIST, reorder_window=0.35)
 

@@ -34,9 +34,8 @@ from pose_graph_ros.core.sources.queued import Queued
 
 
 class ClosureJudge:
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, chain: OdometryChain,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting,
+                 chain: OdometryChain) -> None:
         self._smoother, self._reweighting, self._chain = smoother, reweighting, chain
         self.states = cl.ClosureTable(chain)
         self.redecision = Redecision(smoother)
@@ -59,7 +58,7 @@ class ClosureJudge:
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
             for number, state in self._tested(numbers[:self._most]).items():
-                self.states.state[number] = vd.STATES.index(state)
+                self.states.state[number] = state
         return self.states.in_graph[numbers].astype(np.float64)
 
     def withhold(self) -> FloatArray | None:
@@ -96,7 +95,7 @@ class ClosureJudge:
         by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
         return max(min(BELIEF.tests_in_part, by_size), 1)
 
-    def _tested(self, numbers: IntArray) -> dict[int, vd.State]:
+    def _tested(self, numbers: IntArray) -> dict[int, int]:
         """Test closures that are not in the graph; return the states of those to believe."""
         some, states = self.states.rows(numbers), self.states
         errors, spread = self._smoother.innovations(cl.as_edges(some))
@@ -107,7 +106,7 @@ class ClosureJudge:
         states.round[numbers] = self._round
         states.state[numbers] = np.where(distance < cl.GATE, vd.WAITING, vd.DOUBTED)
         chance = cl.chances(spread + some.noise, self._smoother.graph.extent)
-        chosen = dict[int, vd.State]()
+        chosen = dict[int, int]()
         for k, number in enumerate(numbers.tolist()):
             if number < len(states) - self._n_staged:
                 states.announce(number, int(before[k]), self._now_ns)
@@ -118,9 +117,9 @@ class ClosureJudge:
                     np.sum(counts[vd.USED]) + 1.0)
                 if (alone and chance[k] <= BELIEF.wrong_odds) or states.is_supported(
                         number, (states.decision != vd.OUT) & ~states.forgotten):
-                    chosen[number] = vd.State.BELIEVED
+                    chosen[number] = vd.BELIEVED
                 elif alone:
-                    chosen[number] = vd.State.WEAKLY_BELIEVED
+                    chosen[number] = vd.WEAK
         return chosen
 
     def after(self) -> None:
@@ -171,7 +170,7 @@ class ClosureJudge:
         inside = inside[factors['energy'][rows] > 0.5 * cl.GATE * factors['weight'][rows]]
         some = states.rows(inside)
         bad = inside[cl.squares(graph.errors(cl.as_edges(some)), some.noise) > cl.GATE]
-        thrown_out = self._change(dict.fromkeys(bad.tolist(), vd.State.DOUBTED))
+        thrown_out = self._change(dict.fromkeys(bad.tolist(), vd.DOUBTED))
         # those that contradict one another would take turns in the graph for ever
         self._let_rest(bad)
         return thrown_out
@@ -193,12 +192,11 @@ class ClosureJudge:
                               self.states.in_graph[numbers].tolist(), strict=True):
             self._reweighting.set_base_weight(held, float(used))
 
-    def _change(self, changes: Mapping[int, vd.State], *, at_once: bool = False) -> bool:
+    def _change(self, changes: Mapping[int, int], *, at_once: bool = False) -> bool:
         """Change states and weights; tell whether there were any, and it has not diverged."""
         if len(changes) == 0:
             return False
-        weights = {int(self.states.held[number]): float(state.in_graph)
-                   for number, state in changes.items()}
+        weights = {int(self.states.held[k]): float(vd.USED[to]) for k, to in changes.items()}
         result = self._smoother.update(GraphUpdate(weigh=weights), fall_back=at_once)
         if result.status is Status.FAILED:
             numbers = np.array([*changes])
@@ -208,25 +206,25 @@ class ClosureJudge:
         self._note(changes)
         return True
 
-    def _note(self, changes: Mapping[int, vd.State]) -> None:
+    def _note(self, changes: Mapping[int, int]) -> None:
         """Change states, of which the graph has the weights already."""
         for number, state in sorted(changes.items()):
             before = int(self.states.state[number])
-            self.states.state[number] = vd.STATES.index(state)
+            self.states.state[number] = state
             self.states.announce(number, before, self._now_ns)
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
-        if not all(state.in_graph for state in changes.values()):
+        if not np.all(vd.USED[[*changes.values()]]):
             self.states.spread[:] = cl.ANYTHING * np.eye(3)     # without them it is less certain
 
-    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
+    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, int]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""
         states = self.states
         numbers = states.numbers(decided)
-        now, later = states.in_graph, np.isin(states.held, believed)
-        return {k: (vd.State.DOUBTED if not later[k] else
-                    vd.STATES[states.state[k]] if now[k] else vd.State.BELIEVED)
-                for k in numbers[states.judged[numbers] & (now | later)[numbers]].tolist()}
+        now, later = states.in_graph[numbers], np.isin(states.held[numbers], believed)
+        to = np.where(later, np.where(now, states.state[numbers], vd.BELIEVED), vd.DOUBTED)
+        chosen = states.judged[numbers] & (now | later)
+        return dict(zip(numbers[chosen].tolist(), to[chosen].tolist(), strict=True))
 
     # --- all closures together -------------------------------------------------------------------
 
@@ -251,7 +249,7 @@ class ClosureJudge:
             return
         believed = decided[choice.believed]
         changes = self._changes_to(decided, believed)
-        weights = {int(states.held[k]): float(each.in_graph) for k, each in changes.items()}
+        weights = {int(states.held[k]): float(vd.USED[to]) for k, to in changes.items()}
         changed = np.array([*weights], dtype=np.int64)
 
         if (yield from self.redecision.tried(
@@ -327,8 +325,8 @@ class ClosureJudge:
         """
         states = self.states
         before = int(states.decision[number])
-        state = {vd.Decision.IN: vd.State.BELIEVED, vd.Decision.OUT: vd.State.DOUBTED,
-                 vd.Decision.AUTO: vd.State.WAITING}[decision]
+        state = {vd.Decision.IN: vd.BELIEVED, vd.Decision.OUT: vd.DOUBTED,
+                 vd.Decision.AUTO: vd.WAITING}[decision]
         forced = decision is not vd.Decision.AUTO or before != vd.AUTO
         states.decision[number] = vd.DECISIONS.index(decision)
         states.forgotten[number] = False

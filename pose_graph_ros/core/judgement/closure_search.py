@@ -137,10 +137,8 @@ class _Gates:
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 
 
-def best(
-    problem: TruncatedProblem, inside: BoolArray | None = None, present: FloatArray | None = None,
-    gain: float = 0.0,
-) -> Choosing:
+def best(problem: TruncatedProblem, inside: BoolArray | None = None,
+         present: FloatArray | None = None, gain: float = 0.0) -> Choosing:
     """
     Return the set with the lowest truncated cost; None if the graph cannot be solved.
 
@@ -164,9 +162,8 @@ def best(
     # the surest ones have led to a minimum that is better than that from odometry
     found = odometry if surest is None else problem.graph.poses.copy()
     choices = list[tuple[float, Choice]]()
-    for believed, start, less in (
-            (inside if is_sparse else None, present, gain), (surest, found, 0.0),
-            (~everything, found, 0.0)):
+    for believed, start, less in ((inside if is_sparse else None, present, gain),
+                                  (surest, found, 0.0), (~everything, found, 0.0)):
         problem.begin_at(start)
         choice = None if believed is None else (yield from problem.choice(believed))
         if choice is not None:
@@ -196,10 +193,8 @@ def _completed(problem: TruncatedProblem, choice: Choice) -> Choosing:
 CONFIG = SolverConfig(max_iterations=100)
 
 
-def decide(
-    graph: Graph, ids: IntArray, forced: IntArray, inside: BoolArray,
-    losses: Reweighting | None = None,
-) -> Choosing:
+def decide(graph: Graph, ids: IntArray, forced: IntArray, inside: BoolArray,
+           losses: Reweighting | None = None) -> Choosing:
     """
     Return which loop closures to believe, with poses by row; None if the graph cannot be solved.
 
@@ -280,10 +275,8 @@ class Redecision:
         return (self.job is not None and self._solves) or (
             graph.n_nodes > BELIEF.small and graph.next_ids.node < self._next_solution)
 
-    def tried(
-        self, weights: Mapping[int, float], poses: FloatArray | None = None,
-        may_adopt: Callable[[], bool] = lambda: True,
-    ) -> Generator[None, None, bool]:
+    def tried(self, weights: Mapping[int, float], poses: FloatArray | None = None,
+              may_adopt: Callable[[], bool] = lambda: True) -> Generator[None, None, bool]:
         """Solve a copy with other weights; return whether the graph is that now."""
         trial = self._smoother.trial(GraphUpdate(weigh=weights), poses)
         while trial.work():

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.batch.truncated import LIMITS
-from pose_graph_ros.core.compiled.jit import kernel, MATRICES, NUMBERS, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
@@ -97,24 +96,8 @@ def forward(edges: Factors) -> Factors:
 
 def squares(errors: FloatArray, covariances: FloatArray) -> FloatArray:
     """Return squared Mahalanobis distances of errors, shape (M,)."""
-    out = np.empty(len(errors))
-    _write_squares(np.ascontiguousarray(errors), np.ascontiguousarray(covariances), out)
-    return out
-
-
-@kernel(signature=(ROWS, MATRICES, NUMBERS))
-def _write_squares(errors, covariances, out):  # type: ignore[no-untyped-def]
-    for k in range(len(errors)):
-        m, e = covariances[k], errors[k]
-        # m = L L^T, and L^-1 e
-        l00 = math.sqrt(m[0, 0])
-        l10, l20 = m[1, 0] / l00, m[2, 0] / l00
-        l11 = math.sqrt(m[1, 1] - l10 * l10)
-        l21 = (m[2, 1] - l20 * l10) / l11
-        x = e[0] / l00
-        y = (e[1] - l10 * x) / l11
-        z = e[2] - l20 * x - l21 * y
-        out[k] = x * x + y * y + z * z / (m[2, 2] - l20 * l20 - l21 * l21)
+    return np.einsum(
+        'mi,mi->m', errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
 
 
 def as_edges(some: Closures) -> Factors:
@@ -142,21 +125,17 @@ def chances(covariance: FloatArray, extent: FloatArray) -> FloatArray:
 
 
 class ClosureTable(Judgements):
-    i, j, mean, noise = Column(), Column(), Column(), Column()
-    spread, travel = Column(), Column()
-    forgotten, round, resting = Column(), Column(), Column()
+    KIND = vd.Judged.LOOP_CLOSURE
+    i, j = Column(np.int64), Column(np.int64)   # as in `Closures`
+    mean, noise = Column(np.float64, 3), Column(np.float64, 3, 3)
+    spread = Column(np.float64, 3, 3)  # of the prediction when it was tested last
+    travel = Column(np.float64, 2)  # way along the path to both ends [m]
+    forgotten = Column(np.bool_)  # hopeless, and not judged again
+    round = Column(np.int64, new=NEVER)  # of its last test
+    resting = Column(np.int64)  # id of the node until which it is not tested
 
     def __init__(self, chain: OdometryChain) -> None:
-        super().__init__(
-            vd.Judged.LOOP_CLOSURE, [
-                ('i', np.int64), ('j', np.int64), ('mean', np.float64, (3,)),   # as in `Closures`
-                ('noise', np.float64, (3, 3)),
-                ('spread', np.float64, (3, 3)),  # of the prediction when it was tested last
-                ('travel', np.float64, (2,)),  # way along the path to both ends [m]
-                ('forgotten', np.bool_),  # hopeless, and not judged again
-                ('round', np.int64),  # of its last test
-                ('resting', np.int64)],  # id of the node until which it is not tested
-            round=NEVER)
+        super().__init__()
         self.chain = chain
         # numbers by the way to the later end, and these ways; none after a change
         self._by_end: tuple[IntArray, FloatArray] | None = None
@@ -256,7 +235,6 @@ class ClosureTable(Judgements):
                             if vd.USED[self.state[other]]]
             if self.distance[number] > math.sqrt(GATE):
                 contradicted.insert(0, vd.ODOMETRY)
-            verdicts.append(self.verdict(
-                number, residual, supported_by=around[agrees].tolist(),
-                contradicted_by=contradicted))
+            verdicts.append(self.verdict(number, residual, contradicted_by=contradicted,
+                                         supported_by=around[agrees].tolist()))
         return verdicts

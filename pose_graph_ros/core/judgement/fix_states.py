@@ -10,7 +10,6 @@ and keeps the weights. Here it is told which odometry is doubted.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple
 
@@ -32,11 +31,8 @@ ALIKE_WITHIN = 50
 
 
 class FixStates(Judgements):
-    run = Column()
-
-    def __init__(self) -> None:
-        # id of the first one of its fault, `LONE` or `GOOD`
-        super().__init__(vd.Judged.FIX, [('run', np.int64)], run=LONE)
+    KIND = vd.Judged.FIX
+    run = Column(np.int64, new=LONE)  # id of the first one of its fault, `LONE` or `GOOD`
 
     @property
     def believed(self) -> BoolArray:
@@ -182,8 +178,8 @@ class OdometryStates:
             edges = graph.factors_at(np.array(doubt.edges))
             begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
             chi2 = np.sum(energies(graph.errors(edges), edges.information))
-            verdicts.append(replace(
-                doubt.verdict, distance=float(np.sqrt(chi2)), residual=se2.between(
+            verdicts.append(doubt.verdict._replace(
+                distance=float(np.sqrt(chi2)), residual=se2.between(
                     reduce(se2.compose, edges.mean), se2.between(begin, end)),
                 contradicted_by=fixes.believed_after(doubt.verdict.stamp_ns)))
         return verdicts
@@ -192,7 +188,7 @@ class OdometryStates:
         counts = Counter[str]()
         for doubt in self._gaps.values():
             counts[doubt.verdict.source] += len(doubt.edges)
-        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + self._nodes.n_thinned
         return {source: vd.SourceVerdicts(
             {vd.State.BELIEVED: n - n_left - counts[source], vd.State.DOUBTED: counts[source]},
             doubting=False, n_left=n_left, n_left_unused=self.left[source])

@@ -12,7 +12,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,8 +40,7 @@ from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.queued import Queued
 
 
-@dataclass(frozen=True, slots=True)
-class SavedJudgement:
+class SavedJudgement(NamedTuple):
     closures: SavedVerdicts
     fixes: SavedVerdicts
     loosened: Integers  # ids of odometry edges that are believed less than claimed
@@ -54,10 +53,8 @@ class SavedJudgement:
 class Judge:
     """Judges the constraints of a graph; it knows no clock, and nothing of how they arrived."""
 
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
-        factors: FactorBuilder,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
+                 factors: FactorBuilder) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._nodes, self._factors, self._chain = nodes, factors, OdometryChain()
         self.fixes = FixJudge(smoother, reweighting, nodes, factors, self._chain)
@@ -211,7 +208,7 @@ class Judge:
         unused += fixes.verdicts(graph, leaving[-MOST_OTHERS:])
         unused += [each for each in self._odometry.verdicts(graph, fixes)
                    if each.number in factors]
-        return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
+        return [each._replace(left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
     def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[vd.Verdict]) -> None:
         self._chain.forget(nodes)
@@ -238,9 +235,8 @@ class Judge:
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
         nodes, known = self._chain.nodes, self._nodes
-        self._chain.correct(
-            before, after, known.stamps_ns[np.searchsorted(known.ids, nodes)],
-            ~np.isin(nodes[1:], known.relocated_ids))
+        stamps_ns = known.stamps_ns[np.searchsorted(known.ids, nodes)]
+        self._chain.correct(before, after, stamps_ns, ~np.isin(nodes[1:], known.relocated_ids))
 
     def finish(self, undo: ExitStack[bool]) -> None:
         """

@@ -9,8 +9,7 @@ Loop closures have one, positions and poses in the map another.
 from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,35 +27,14 @@ NEW = -1
 LEFT, UNKNOWN = -1, -2
 # Of each source, the newest of those that are not simply believed.
 MOST_OTHERS = 500
-COLUMNS: list[Any] = [
-    ('held', np.int64),  # id of what holds it, an edge or an observed node
-    ('added', np.int64),  # id of the factor that it was added as
-    ('source', np.int64),  # index of its source
-    ('number', np.int64),  # in its name
-    ('stamps_ns', np.int64, (2,)),  # of the measurement, and of the other end of a loop closure
-    ('state', np.int64),  # index of its state
-    ('since_ns', np.int64),  # newest odometry when it came, or its use began or ended
-    ('decision', np.int64),  # index of what a person has decided
-    # Mahalanobis distance when it was judged, of a closure the last time; nan before [sigma]
-    ('distance', np.float64)]
 Records = npt.NDArray[Any]
 
 
-SAVED = np.dtype(COLUMNS)
-
-
-@dataclass(frozen=True, slots=True)
-class SavedVerdicts:
-    """The columns of a table, and its sources."""
-
-    sources: tuple[str, ...]
-    # of each source, how many have left the graph, by their states then
-    left: Annotated[IntArray, sc.Column(int, (len(vd.State),))]
-    table: Annotated[GrowingArray, sc.Column(SAVED)]  # the distance is -1 if it was not judged
-
-
 class Column:
-    """A column of the records of `Judgements`, writeable, by its name."""
+    """A column of the records of `Judgements`, writeable, and what it is for a new one."""
+
+    def __init__(self, kind: Any, *shape: int, new: float = 0) -> None:
+        self.kind, self.shape, self.new = kind, shape, new
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
@@ -66,15 +44,24 @@ class Column:
 
 
 class Judgements:
-    held, added, source, number = Column(), Column(), Column(), Column()
-    stamps_ns, state, since_ns = Column(), Column(), Column()
-    decision, distance = Column(), Column()
+    KIND: ClassVar[vd.Judged]
+    held = Column(np.int64)  # id of what holds it, an edge or an observed node
+    added = Column(np.int64)  # id of the factor that it was added as
+    source = Column(np.int64)  # index of its source
+    number = Column(np.int64)  # in its name
+    stamps_ns = Column(np.int64, 2)  # of the measurement, and of the other end of a loop closure
+    state = Column(np.int64)  # index of its state
+    since_ns = Column(np.int64)  # newest odometry when it came, or its use began or ended
+    decision = Column(np.int64, new=vd.AUTO)  # index of what a person has decided
+    # Mahalanobis distance when it was judged, of a closure the last time; nan before [sigma]
+    distance = Column(np.float64, new=np.nan)
 
-    def __init__(self, kind: vd.Judged, more: Sequence[Any] = (), **new: int) -> None:
-        """Make an empty table; more columns are not saved, and `new` or 0 in new constraints."""
+    def __init__(self) -> None:
         self.sources: list[str] = []
-        self._kind, self._new = kind, {'decision': vd.AUTO, 'distance': np.nan, **new}
-        self._records = GrowingArray((), np.dtype([*COLUMNS, *more], align=True))
+        self._columns = {name: each for kind in reversed(type(self).__mro__)
+                         for name, each in vars(kind).items() if isinstance(each, Column)}
+        self._records = GrowingArray((), np.dtype([
+            (name, each.kind, each.shape) for name, each in self._columns.items()], align=True))
         # of each source, how many have left the graph, by their states then, and the next number
         self._left: list[IntArray] = []
         self._next: list[int] = []
@@ -102,11 +89,11 @@ class Judgements:
 
     def append(self, one: Queued, now_ns: int, state: int, **more: float) -> None:
         record, source = np.zeros((), self.records.dtype), self.index_of(one.source)
-        for name, value in {
-                'held': one.held, 'added': one.number, 'source': source,
-                'number': self._next[source], 'stamps_ns': (one.stamp_ns, one.reference_ns),
-                'state': state, 'since_ns': now_ns, **self._new, **more}.items():
-            record[name] = value
+        values = {'held': one.held, 'added': one.number, 'source': source, 'since_ns': now_ns,
+                  'number': self._next[source], 'stamps_ns': (one.stamp_ns, one.reference_ns),
+                  'state': state, **more}
+        for name, column in self._columns.items():
+            record[name] = values.get(name, column.new)
         self._records.append_one(record)
         self._next[source] += 1
 
@@ -155,7 +142,7 @@ class Judgements:
             record['since_ns'] = now_ns
         if before != NEW or not new.in_graph:
             self._changes.append(vd.Change(
-                self.name(row), self._kind, self.sources[record['source']],
+                self.name(row), self.KIND, self.sources[record['source']],
                 int(record['stamps_ns'][0]), None if before == NEW else vd.STATES[before], new))
 
     def take_changes(self) -> list[vd.Change]:
@@ -169,16 +156,14 @@ class Judgements:
         undo.callback(np.copyto, self.records, self.records.copy())
         undo.callback(setattr, self, '_changes', self._changes.copy())
 
-    def verdict(
-        self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
-        contradicted_by: Sequence[str],
-    ) -> vd.Verdict:
+    def verdict(self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
+                contradicted_by: Sequence[str]) -> vd.Verdict:
         record = self.records[row]
         stamp, reference = record['stamps_ns'].tolist()
         return vd.Verdict(
-            id=self.name(row), kind=self._kind, source=self.sources[record['source']],
+            id=self.name(row), kind=self.KIND, source=self.sources[record['source']],
             stamp_ns=stamp, since_ns=int(record['since_ns']), state=vd.STATES[record['state']],
-            reference_ns=reference if self._kind is vd.Judged.LOOP_CLOSURE else None,
+            reference_ns=reference if self.KIND is vd.Judged.LOOP_CLOSURE else None,
             decision=vd.DECISIONS[record['decision']], residual=residual,
             distance=float(record['distance']),
             supported_by=tuple(self.name(other) for other in supported_by[:vd.MOST_NAMED]),
@@ -203,29 +188,41 @@ class Judgements:
             totals[source] = vd.SourceVerdicts(
                 dict(zip(vd.STATES, (self.counts(index) - left).tolist(), strict=True)),
                 # wrong closures among right ones are what place recognition is like
-                doubting=(self._kind is not vd.Judged.LOOP_CLOSURE and len(newest) > 0
+                doubting=(self.KIND is not vd.Judged.LOOP_CLOSURE and len(newest) > 0
                           and not bool(np.any(vd.USED[newest]))),
                 n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~vd.USED])))
         return totals
 
-    def saved(self) -> SavedVerdicts:
+    def saved(self) -> 'SavedVerdicts':
         table = self.records[list(SAVED.names or ())].astype(SAVED)
         table['distance'] = np.nan_to_num(table['distance'], nan=-1.0)
         return SavedVerdicts(
             tuple(self.sources), np.array(self._left, dtype=np.int64).reshape(
                 -1, len(vd.STATES)), GrowingArray.of(table))
 
-    def restore(self, saved: SavedVerdicts) -> None:
+    def restore(self, saved: 'SavedVerdicts') -> None:
         """Fill the empty table with saved columns."""
         for source in saved.sources:
             self.index_of(source)
         records = np.zeros(len(saved.table), dtype=self.records.dtype)
-        for name in self._new:
-            records[name] = self._new[name]
-        for name in SAVED.names or ():
-            records[name] = saved.table[name]
+        for name, column in self._columns.items():
+            records[name] = saved.table[name] if name in (SAVED.names or ()) else column.new
         records['distance'][records['distance'] < 0.0] = np.nan
         self._records.append(records)
         for index, left in enumerate(saved.left):
             self._left[index] = left.copy()
             self._next[index] = int(np.sum(self.counts(index)))
+
+
+# What is saved of a record; the columns of special tables follow from these.
+SAVED = np.dtype([(name, each.kind, each.shape) for name, each in vars(Judgements).items()
+                  if isinstance(each, Column)])
+
+
+class SavedVerdicts(NamedTuple):
+    """The columns of a table, and its sources."""
+
+    sources: tuple[str, ...]
+    # of each source, how many have left the graph, by their states then
+    left: Annotated[IntArray, sc.Column(int, (len(vd.State),))]
+    table: Annotated[GrowingArray, sc.Column(SAVED)]  # the distance is -1 if it was not judged

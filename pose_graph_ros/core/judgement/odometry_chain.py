@@ -113,10 +113,8 @@ class OdometryChain:
         self._sums.append(sums[1:n + 1])
         self._travel.append(self._travel.values[last] + _lengths(poses[:n + 1]))
 
-    def correct(
-        self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
-        by_odometry: BoolArray,
-    ) -> None:
+    def correct(self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
+                by_odometry: BoolArray) -> None:
         """Follow edges that know of other errors now; `by_odometry` tells which steps do."""
         if len(self) < 2:
             return

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers by which constraints are judged."""
 
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 from pose_graph_ros.core.belief.settings import BANK
 
 
-@dataclass(frozen=True, slots=True)
-class BeliefSettings:
+class BeliefSettings(NamedTuple):
     """Meaning and unit of each number stand beside it."""
 
     # --- tests of loop closures

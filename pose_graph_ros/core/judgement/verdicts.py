@@ -3,7 +3,6 @@
 """What is decided on a constraint, and why, as values; `judgements` is the table of them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -55,8 +54,7 @@ class Judged(Enum):
     ODOMETRY = 'odometry'
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     # `SOURCE/NUMBER`, such as `loop_closure/17`: the constraints of a source are counted from 0 in
     # the order of their addition. It never changes.
     id: str

@@ -99,9 +99,8 @@ def descend(J: FloatArray, W: FloatArray, p: IntArray, q: IntArray) -> None:
                 break
 
 
-def _definite(
-    J: FloatArray, W: FloatArray, mu: float,
-) -> list[tuple[float, float, FloatArray, FloatArray]]:
+def _definite(J: FloatArray, W: FloatArray,
+              mu: float) -> list[tuple[float, float, FloatArray, FloatArray]]:
     """
     Return the matrices whose `-log det` keeps them positive definite, each with sign and weight.
 

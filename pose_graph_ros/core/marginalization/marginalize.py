@@ -83,10 +83,8 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
         remove_nodes=leaving.tolist(), priors=tuple(priors))
 
 
-def marginal(
-    graph: Graph, nodes: Collection[int], factors: Collection[int] = (),
-    cuts: Sequence[Cut] = (),
-) -> Prior | None:
+def marginal(graph: Graph, nodes: Collection[int], factors: Collection[int] = (),
+             cuts: Sequence[Cut] = ()) -> Prior | None:
     """
     Return what all constraints of leaving nodes, and further ones, say about the other nodes.
 
@@ -134,9 +132,8 @@ def marginal(
                  _symmetric(U[np.ix_(says, says)]), u[says], energy, anchored)
 
 
-def schur_complement(
-    H: FloatArray, b: FloatArray, rows: IntArray,
-) -> tuple[FloatArray, FloatArray]:
+def schur_complement(H: FloatArray, b: FloatArray,
+                     rows: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return a semidefinite system without some nodes, which take their best values."""
     H, b = H.copy(), b.copy()
     eliminate(H, b, rows, np.diagonal(H).copy())
@@ -173,9 +170,8 @@ def as_edge(prior: Prior) -> Factors:
     information = _semidefinite(prior.information[at, at])
     delta = np.zeros((2, 3))
     delta[second] = _pseudo_inverse(information) @ prior.vector[at]
-    return edges_between(
-        prior.nodes, (prior.reference, delta), np.array([first]), np.array([second]),
-        information[None])
+    return edges_between(prior.nodes, (prior.reference, delta), np.array([first]),
+                         np.array([second]), information[None])
 
 
 def as_observed(prior: Prior) -> Factors:
@@ -197,9 +193,8 @@ def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
     return ids
 
 
-def part_of(
-    graph: Graph, ids: IntArray, factors: IntArray | BoolArray, priors: Sequence[Prior] = (),
-) -> Graph:
+def part_of(graph: Graph, ids: IntArray, factors: IntArray | BoolArray,
+            priors: Sequence[Prior] = ()) -> Graph:
     """Return a graph of some nodes, by ids, and of some factors on them alone, by rows."""
     rows, part = graph.node_rows(ids), Graph()
     part.fill(GraphRows(

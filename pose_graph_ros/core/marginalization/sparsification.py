@@ -63,9 +63,8 @@ class _Candidates(NamedTuple):
     weights: FloatArray     # (C,) `log det` of the covariance
 
 
-def sparsify(
-    prior: Prior, *, n_extra: int = 0, enough: float = 1e-9, n_biases: int = 0,
-) -> SparsePrior:
+def sparsify(prior: Prior, *, n_extra: int = 0, enough: float = 1e-9,
+             n_biases: int = 0) -> SparsePrior:
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
 
@@ -173,9 +172,8 @@ def _minimum(basis: FloatArray, vector: FloatArray, n_poses: int) -> FloatArray:
     return np.asarray(delta)
 
 
-def _candidates(
-    poses: FloatArray, basis: FloatArray, free: FloatArray, anchored: bool,
-) -> _Candidates:
+def _candidates(poses: FloatArray, basis: FloatArray, free: FloatArray,
+                anchored: bool) -> _Candidates:
     """Return all measurements that a tree may consist of."""
     n = len(poses)
     of_poses = [each[:3 * n].reshape(n, 3, -1) for each in (basis, free)]
@@ -235,9 +233,8 @@ def _overestimated(found: _Candidates, chosen: IntArray, blocks: FloatArray) -> 
     return others[np.argsort(-gain, kind='stable')]
 
 
-def _of_bias(
-    basis: FloatArray, free: FloatArray, n_poses: int, row: int,
-) -> tuple[FloatArray, _Candidates]:
+def _of_bias(basis: FloatArray, free: FloatArray, n_poses: int,
+             row: int) -> tuple[FloatArray, _Candidates]:
     """
     Return the gain of the measurement `b - gain h` of a bias with the least `log det`, and itself.
 
@@ -273,10 +270,8 @@ def _of_bias(
         (inverse.T * used[:, None])[None], np.zeros(1))
 
 
-def _on_bias(
-    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], at: IntArray, gain: FloatArray,
-    information: FloatArray,
-) -> Prior:
+def _on_bias(nodes: IntArray, displaced: tuple[FloatArray, FloatArray], at: IntArray,
+             gain: FloatArray, information: FloatArray) -> Prior:
     """Return the prior that a measurement of a bias is, given rows of the pose and the bias."""
     poses, delta = displaced
     jacobian = np.hstack((-gain, np.eye(3)))
@@ -285,10 +280,8 @@ def _on_bias(
     return Prior(nodes[at], poses[at].copy(), whole, whole @ delta[at].ravel(), 0.0, True)
 
 
-def edges_between(
-    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], start: IntArray, end: IntArray,
-    in_map: FloatArray,
-) -> Factors:
+def edges_between(nodes: IntArray, displaced: tuple[FloatArray, FloatArray], start: IntArray,
+                  end: IntArray, in_map: FloatArray) -> Factors:
     """
     Return edges with information in map axes whose minimum is at displacements of poses.
 

@@ -162,7 +162,7 @@ class HiddenNodes(NodeTable):
         """Make a source the primary one, and the first node at its first sample."""
         stream = self.streams[source]
         first_ns = stream.first_after(-1)
-        stream.settle_all(first_ns)
+        list(stream.settle(first_ns))
         pose = stream.timeline.poses[0]
         self._set_primary(-1, source)
         self.covered_ns = self._base_ns = first_ns
@@ -187,7 +187,7 @@ class HiddenNodes(NodeTable):
             self._extend(stamp_ns, pose)
         source = self._first_with_sample(others, last_ns, known_ns)
         stream = self.streams[source]
-        stream.settle_all(known_ns)
+        list(stream.settle(known_ns))
         self._add_secondary_edges()
         timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
         self._set_primary(last_ns, source)
@@ -339,7 +339,7 @@ class HiddenNodes(NodeTable):
 
         The motion from an older node is interpolated between that node and the next one.
         """
-        if len(self.thinned) == 0 or len(self) - newest <= self.n_frozen:
+        if self.n_thinned == 0 or len(self) - newest <= self.n_frozen:
             return
         since_ns = int(self.stamps_ns[-newest])
         for stream in self.streams.values():
@@ -382,7 +382,7 @@ class HiddenNodes(NodeTable):
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
             tuple(self._primaries), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
-            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
+            self.frozen.copy(), float(self.travelled[0]), self.places(),
             self.errors, np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
@@ -397,5 +397,5 @@ class HiddenNodes(NodeTable):
             self.streams[name].restore(stream)
         self.relocated = {*saved.relocated.tolist()}
         self.errors = saved.errors
-        if len(self.thinned) > 0:
+        if self.n_thinned > 0:
             self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])

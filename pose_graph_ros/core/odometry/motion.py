@@ -10,7 +10,6 @@ the yaw rate and of the scale that stay the same are taken out of the motion its
 done to edges with any errors in use, and undone, without loss.
 """
 
-from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
@@ -56,8 +55,7 @@ class Span(NamedTuple):
 NO_MOTION = Motion(np.zeros(3), 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(NamedTuple):
     """An instant, given by the last hidden node before it and the motion since."""
 
     node: int  # id of the node in the graph
@@ -72,9 +70,8 @@ def integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
     return exp_one((x, y, theta))
 
 
-def step_variance(
-    source: OdometrySource, twist: Variances | None, step: tuple[float, float], elapsed: float,
-) -> Variances:
+def step_variance(source: OdometrySource, twist: Variances | None, step: tuple[float, float],
+                  elapsed: float) -> Variances:
     """
     Return the variance of (x, y, theta) of a short motion in the robot's frame, but its scale.
 
@@ -189,10 +186,8 @@ def as_calibrated(edges: Factors, nodes: FloatArray) -> Factors:
         edges.mean, -edges.constants[:, 3] * rate, 1.0 + scale))
 
 
-def changed(
-    means: FloatArray, informations: FloatArray, seconds: FloatArray, before: OdometryErrors,
-    after: OdometryErrors,
-) -> tuple[FloatArray, FloatArray]:
+def changed(means: FloatArray, informations: FloatArray, seconds: FloatArray,
+            before: OdometryErrors, after: OdometryErrors) -> tuple[FloatArray, FloatArray]:
     """Return means and informations of edges with other errors than those that they have."""
     claimed = before.inverse_noise.informations(informations)
     return (after.motions(before.as_odometry_says(means, seconds), seconds),
@@ -266,9 +261,8 @@ class SpeedWindow(NamedTuple):
         return SpeedWindow(speeds, stamp_ns, pose)
 
 
-def is_jump(
-    speeds: Speeds, step: tuple[float, float], elapsed: float, stated: float, limit: float,
-) -> bool:
+def is_jump(speeds: Speeds, step: tuple[float, float], elapsed: float, stated: float,
+            limit: float) -> bool:
     """
     Tell whether a step (length, absolute turn) is longer than the robot can have moved.
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -16,93 +15,16 @@ from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Column, Integers, Rows3
 
-
-class Place(NamedTuple):
-    """Where a node is relative to another one."""
-
-    anchor: int  # number of the node that stands for it
-    mean: se2.PoseVector  # pose in the anchor
-    noise: se2.Covariance  # of that pose, in the frame of the node
-
-
 # Nodes that have left although older ones stay: their numbers, ascending, those of nodes beside
 # them, their poses in these, and the upper triangles of the covariances of these poses, in the
 # frames of the nodes.
 PLACES = np.dtype(
     [('numbers', 'i8'), ('anchors', 'i8'), ('relative', 'f8', 3), ('noise', 'f8', 6)])
 THINNED = np.dtype([('anchors', 'i4'), ('relative', 'f4', 3), ('noise', 'f4', 6)])
+IN_GRAPH = np.array((-1, np.zeros(3), np.zeros(6)), THINNED)
 
 
-class ThinnedNodes:
-    """
-    Nodes by number, each with its place relative to another one in the graph, its anchor.
-
-    The poses of these nodes move with the graph, and what concerns them later is attached to their
-    anchors. If an anchor leaves as well, the nodes that were attached to it are passed on to its
-    own anchor. A node takes 40 bytes, and a group of nodes a time that hardly grows with them.
-    """
-
-    def __init__(self, first: int = 0) -> None:
-        # by number, from the first node that is not frozen on; -1 for nodes that are in the graph
-        self._first, self._size = first, 0
-        self._rows = GrowingArray((), THINNED)
-
-    def __len__(self) -> int:
-        return self._size
-
-    def add(
-        self, numbers: IntArray, anchors: IntArray, relative: Poses, noise: se2.Covariances,
-    ) -> None:
-        """Add nodes; none of the anchors is among these, or has left before."""
-        if len(numbers) == 0:
-            return
-        rows = numbers - self._first
-        more = int(np.max(rows)) + 1 - len(self._rows)
-        if more > 0:
-            self._rows.append(np.zeros(more, THINNED))
-            self._rows['anchors'][-more:] = -1
-        table = self._rows.values
-        table['anchors'][rows], table['relative'][rows] = anchors, relative
-        table['noise'][rows] = upper(noise)
-        self._size += len(rows)
-        passed = np.flatnonzero(np.isin(table['anchors'], numbers))
-        own, before = table[passed], table[table['anchors'][passed] - self._first]
-        first, then = (Span(each['relative'].astype(float), full(each['noise'].astype(float)))
-                       for each in (before, own))
-        both = first.continued(*then)
-        table['relative'][passed], table['noise'][passed] = both.mean, upper(both.covariance)
-        table['anchors'][passed] = before['anchors']
-
-    def place(self, number: int) -> Place | None:
-        """Return the place of a node; None if it is not among these."""
-        row = number - self._first
-        if not 0 <= row < len(self._rows) or self._rows['anchors'][row] < 0:
-            return None
-        anchor, mean, noise = self._rows.values[row]
-        return Place(int(anchor), mean.astype(float), full(noise[None].astype(float))[0])
-
-    def places(self) -> GrowingArray:
-        """Return the places of all nodes, records of `PLACES`."""
-        rows = np.flatnonzero(self._rows['anchors'] >= 0)
-        places = np.empty(len(rows), PLACES)
-        places['numbers'] = rows + self._first
-        places[['anchors', 'relative', 'noise']] = self._rows.values[rows]
-        return GrowingArray.of(places)
-
-    def drop_before(self, number: int) -> None:
-        """
-        Drop the nodes before a number, whose poses are frozen with those of the oldest nodes.
-
-        The anchors of the others must not be before it.
-        """
-        n = min(number - self._first, len(self._rows))
-        self._size -= int(np.count_nonzero(self._rows['anchors'][:n] >= 0))
-        self._rows.drop_first(n)
-        self._first = number
-
-
-@dataclass(frozen=True, slots=True)
-class SavedNodes:
+class SavedNodes(NamedTuple):
     """Saved hidden nodes, and the state of the odometry sources."""
 
     stamps_ns: Integers
@@ -137,15 +59,18 @@ class NodeTable:
 
     The first `n_frozen` of them have left the graph: their poses do not change any more, but for
     motions of the whole map, and a node takes 40 bytes. The number of a node, such as 42 of x42,
-    is its index among all of them, and never changes. Of the others, too, some may have left
-    (`thinned`); their poses move with those of other nodes. All arrays are read-only views.
+    is its index among all of them, and never changes. Of the others, too, some may have left:
+    their poses move with those of other nodes in the graph, their anchors, and what concerns them
+    later is attached to these. If an anchor leaves as well, the nodes that were attached to it are
+    passed on to its own anchor. All arrays are read-only views.
     """
 
     def __init__(self) -> None:
         self._stamps, self._ids = GrowingArray((), np.int64), GrowingArray((), np.int64)
         self._frozen, self._odometry = GrowingArray((3,), float), GrowingArray((3,), float)
         self._travelled = 0.0  # path length up to the first node that is not frozen [m]
-        self.thinned = ThinnedNodes()
+        # of each node after the frozen ones, where it is if it has left; else the anchor is -1
+        self._places, self.n_thinned = GrowingArray((), THINNED), 0
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -191,37 +116,60 @@ class NodeTable:
         self._stamps.append_one(stamp_ns)
         self._ids.append_one(node)
         self._odometry.append_one(odometry)
+        self._places.append_one(IN_GRAPH)
 
     def freeze(self, poses: Poses) -> None:
         """Freeze the oldest nodes in the graph at the given poses."""
         self._travelled = float(self.travelled[len(poses)])
         self._frozen.append(poses)
+        self.n_thinned -= int(np.count_nonzero(self._places['anchors'][:len(poses)] >= 0))
         self._odometry.drop_first(len(poses))
-        self.thinned.drop_before(self.n_frozen)
+        self._places.drop_first(len(poses))
+
+    def places(self) -> GrowingArray:
+        """Return where the nodes are that have left but are not frozen, records of `PLACES`."""
+        rows = np.flatnonzero(self._places['anchors'] >= 0)
+        places = np.empty(len(rows), PLACES)
+        places['numbers'] = rows + self.n_frozen
+        places[['anchors', 'relative', 'noise']] = self._places.values[rows]
+        return GrowingArray.of(places)
 
     def placed(self, present: Poses) -> Poses:
         """Return poses of the nodes that are not frozen, overwritten where one was thinned out."""
-        if len(self.thinned) > 0:
-            thinned, first = self.thinned.places(), self.n_frozen
+        if self.n_thinned > 0:
+            thinned, first = self.places(), self.n_frozen
             present[thinned['numbers'] - first] = se2.compose(
                 present[thinned['anchors'] - first], thinned['relative'])
         return present
 
     def attachment(self, number: int, mean: se2.PoseVector, noise: se2.Covariance) -> Attachment:
         """Return the attachment of a motion from a node, or from the one that stands for it."""
-        place = self.thinned.place(number)
-        if place is None:
-            return Attachment(int(self.ids[number]), mean, noise)
-        return Attachment(
-            int(self.ids[place.anchor]), *Span(place.mean, place.noise).continued(mean, noise))
+        anchor, there, spread = self._places.values[number - self.n_frozen]
+        if anchor >= 0:
+            there, spread = there.astype(float), full(spread[None].astype(float))[0]
+            number, (mean, noise) = int(anchor), Span(there, spread).continued(mean, noise)
+        return Attachment(int(self.ids[number]), mean, noise)
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""
-        return number < self.n_frozen or self.thinned.place(number) is not None
+        row = number - self.n_frozen
+        return row < 0 or bool(self._places['anchors'][row] >= 0)
 
-    def thin(self, ids: IntArray, anchors: IntArray, *places: FloatArray) -> None:
+    def thin(self, ids: IntArray, anchors: IntArray, relative: Poses,
+             noise: se2.Covariances) -> None:
         """Let nodes leave, each with its place, and its noise, relative to a node that stays."""
-        self.thinned.add(*np.searchsorted(self.ids, (ids, anchors)), *places)
+        numbers, anchors = np.searchsorted(self.ids, (ids, anchors))
+        rows, table = numbers - self.n_frozen, self._places.values
+        table['anchors'][rows], table['relative'][rows] = anchors, relative
+        table['noise'][rows] = upper(noise)
+        self.n_thinned += len(rows)
+        passed = np.flatnonzero(np.isin(table['anchors'], numbers))
+        own, before = table[passed], table[table['anchors'][passed] - self.n_frozen]
+        first, then = (Span(each['relative'].astype(float), full(each['noise'].astype(float)))
+                       for each in (before, own))
+        both = first.continued(*then)
+        table['relative'][passed], table['noise'][passed] = both.mean, upper(both.covariance)
+        table['anchors'][passed] = before['anchors']
 
     def move_frozen(self, T: se2.PoseVector) -> None:
         """Move the frozen poses by a rigid motion of the map."""
@@ -232,7 +180,7 @@ class NodeTable:
         """Fill this empty table."""
         self._stamps, self._ids, self._odometry, self._frozen = map(
             GrowingArray.of, (saved.stamps_ns, saved.ids, saved.odometry, saved.frozen))
-        self._travelled, thinned = saved.travelled, saved.thinned
-        self.thinned = ThinnedNodes(self.n_frozen)
-        self.thinned.add(thinned['numbers'], thinned['anchors'], thinned['relative'],
-                         full(thinned['noise']))
+        self._travelled, self.n_thinned = saved.travelled, len(saved.thinned)
+        self._places.append(np.full(len(saved.odometry), IN_GRAPH))
+        self._places.values[saved.thinned['numbers'] - self.n_frozen] = saved.thinned.values[
+            ['anchors', 'relative', 'noise']]

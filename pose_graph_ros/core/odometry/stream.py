@@ -4,7 +4,7 @@
 
 import bisect
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 import operator
 from typing import Generic, NamedTuple, TypeVar
@@ -127,8 +127,7 @@ class Instant(NamedTuple):
     twist: Pose = NO_TWIST  # as `Received.twist`
 
 
-@dataclass(frozen=True, slots=True)
-class SavedStream:
+class SavedStream(NamedTuple):
     """Saved odometry source: its samples next to the hidden nodes, and its newest ones."""
 
     stamps_ns: Integers  # stamps of settled samples, shape (T,) [ns]
@@ -230,11 +229,6 @@ class OdometryStream(ReorderBuffer[Received]):
             self.timeline.append(self._last.row)
             yield self._last.row.stamp_ns, self._last.row.pose
 
-    def settle_all(self, until_ns: int) -> None:
-        """Settle all samples up to a stamp [ns]."""
-        for _ in self.settle(until_ns):
-            pass
-
     def forget(self, before_ns: int) -> None:
         """Drop settled samples that motions from an instant [ns] on do not depend on."""
         self.timeline.drop_before(min(before_ns, self.settled_ns - mo.SPEED_TIME_NS))
@@ -315,11 +309,10 @@ class OdometryStream(ReorderBuffer[Received]):
         Return the motion from a settled instant [ns] to the newest sample, settled or not.
 
         With it comes the pose of that sample as received, shape (3,) [m, m, rad]. Raises
-        ValueError if there are no samples, or they do not cover the instant.
+        ValueError if the samples do not cover the instant.
         """
         last = self._ahead[-1] if self._ahead else self._last
-        if last is None:
-            raise ValueError('there is no odometry')
+        assert last is not None, 'the primary source has samples'
         return self.timeline.motion_to(since_ns, last.row.numbers), np.array(last.raw)
 
     def motion_ahead(self, since_ns: int, stamp_ns: int) -> mo.Motion | None:
@@ -335,11 +328,7 @@ class OdometryStream(ReorderBuffer[Received]):
         ends = OdometryTimeline(rows[after - 1:after + 1])
         if not ends.covers(stamp_ns, closely=True):
             return None
-        first = self.timeline.motion_to(since_ns, rows[after - 1].numbers)
-        last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
-        return mo.Motion(
-            se2.compose(first.increment, last.increment), first.distance + last.distance,
-            first.turn + last.turn, first.variance + last.variance)
+        return self.timeline.motion_to(since_ns, *ends.at(stamp_ns))
 
     def _follow(self, begin: int = 0) -> None:
         """Compute the states at the samples that are not settled, from one on."""
@@ -384,10 +373,8 @@ class OdometryStream(ReorderBuffer[Received]):
                        jumped=False, twist=twist)
 
 
-def _elsewhere(
-    before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
-    speeds: mo.Speeds = mo.UNKNOWN, *, restarted: bool = False,
-) -> Instant:
+def _elsewhere(before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
+               speeds: mo.Speeds = mo.UNKNOWN, *, restarted: bool = False) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
@@ -395,10 +382,8 @@ def _elsewhere(
                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
-def find_silence(
-    streams: Mapping[str, OdometryStream], names: Sequence[str], last_ns: int,
-    settled: tuple[str, int], patience_ns: int,
-) -> tuple[int, int] | None:
+def find_silence(streams: Mapping[str, OdometryStream], names: Sequence[str], last_ns: int,
+                 settled: tuple[str, int], patience_ns: int) -> tuple[int, int] | None:
     """
     Return the first silence of the primary source that is longer than the patience, if any.
 

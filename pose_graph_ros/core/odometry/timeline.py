@@ -48,10 +48,8 @@ class Row(NamedTuple):
         return np.array((*self.pose, self.distance, self.turn, *self.variance))
 
 
-def next_row(
-    before: Row | None, stamp_ns: int, pose: Pose, variance: Variances = NOTHING,
-    loose: Variances = NOTHING,
-) -> Row:
+def next_row(before: Row | None, stamp_ns: int, pose: Pose, variance: Variances = NOTHING,
+             loose: Variances = NOTHING) -> Row:
     """
     Return the row of the next sample.
 
@@ -163,9 +161,8 @@ class OdometryTimeline:
                 if len(column) > 0:
                     column.drop_first(n_old)
 
-    def thinned(
-        self, instants_ns: StampsNs, since_ns: StampNs,
-    ) -> tuple[IntArray, FloatArray, BoolArray]:
+    def thinned(self, instants_ns: StampsNs,
+                since_ns: StampNs) -> tuple[IntArray, FloatArray, BoolArray]:
         """
         Return stamps, rows and `dense` of the samples for the motions between some instants.
 
@@ -185,10 +182,8 @@ class OdometryTimeline:
         return (stamps[keep], self._rows(keep),
                 (self._dense.values & np.append(False, keep[:-1]))[keep])
 
-    def restore(
-        self, stamps_ns: IntArray, rows: FloatArray, dense: BoolArray, last: Row, *,
-        resting: bool,
-    ) -> None:
+    def restore(self, stamps_ns: IntArray, rows: FloatArray, dense: BoolArray, last: Row, *,
+                resting: bool) -> None:
         """Fill this empty timeline with the result of `thinned`."""
         self._stamps, self._samples, self._dense = map(
             GrowingArray.of, (stamps_ns, rows[:, :5], dense))

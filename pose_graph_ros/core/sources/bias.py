@@ -168,9 +168,8 @@ class BiasChain:
         """Return the id of the state of an instant."""
         return int(self.nodes[max(self.at(stamp_ns), 0)])
 
-    def with_bins(
-        self, stamps_ns: IntArray, process: Process, additions: Additions, value: FloatArray,
-    ) -> 'BiasChain':
+    def with_bins(self, stamps_ns: IntArray, process: Process, additions: Additions,
+                  value: FloatArray) -> 'BiasChain':
         """
         Return the chain with a state for the bin of each stamp.
 

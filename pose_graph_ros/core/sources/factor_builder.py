@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariance, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
@@ -180,16 +180,12 @@ class FactorBuilder:
             else:
                 state.measured.append_one(
                     (new.stamp_ns, new.number, new.held_by, new.noise.tolist()))
-            if new.needs_bias:
-                continue    # a rotation has no loss
-            odometry = self.config.odometry.get(new.source) if new.stamp_ns < 0 else None
-            settings = odometry or self._settings(new.source, new.measured)
-            loss = (settings.loss if isinstance(settings, OdometrySource)
-                    else settings.applied_loss)
-            threshold = settings.rejection_threshold
-            self._reweighting.add(new.number, loss, threshold)
+            if new.needs_bias or new.stamp_ns < 0:
+                continue    # neither a rotation nor odometry has a loss
+            settings = self._settings(new.source, new.measured)
+            for number in (new.number, *([new.held_by] if new.held_by >= 0 else ())):
+                self._reweighting.add(number, settings.applied_loss, settings.rejection_threshold)
             if new.held_by >= 0:
-                self._reweighting.add(new.held_by, loss, threshold)
                 self._reweighting.set_base_weight(new.number, 0.0)
         for source, chain in self._chains.items():
             self.keep(source, chain)
@@ -223,9 +219,8 @@ class FactorBuilder:
             return state.errors
         return _given(self._settings(source))
 
-    def set_errors(
-        self, source: str, errors: bs.CorrelatedErrors | None, bias: bs.BiasChain | None,
-    ) -> None:
+    def set_errors(self, source: str, errors: bs.CorrelatedErrors | None,
+                   bias: bs.BiasChain | None) -> None:
         """Treat the measurements of a source with other errors, whose bias is in the graph."""
         state = self.sources[source]
         self.abandon(state.bias)
@@ -248,9 +243,8 @@ class FactorBuilder:
         return {source: float(graph.poses_of(node)[0])
                 for source, node in self._newest_states(graph, 1).items()}
 
-    def calibrations(
-        self, graph: Graph, covariance: Callable[[int], Covariance],
-    ) -> dict[str, bs.Calibration]:
+    def calibrations(self, graph: Graph,
+                     covariance: Callable[[int], Covariance]) -> dict[str, bs.Calibration]:
         """Return what each odometry is calibrated by, given covariances of nodes."""
         found = dict[str, bs.Calibration]()
         if graph.has_touched:
@@ -284,9 +278,8 @@ class FactorBuilder:
         return {source: (state.measured['stamp_ns'], state.held())
                 for source, state in self.sources.items() if self.has(source)}
 
-    def leaving_biases(
-        self, factors: IntArray, others: Mapping[str, bs.BiasChain], graph: Graph,
-    ) -> list[int]:
+    def leaving_biases(self, factors: IntArray, others: Mapping[str, bs.BiasChain],
+                       graph: Graph) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
         ends = graph.factor_records['ends'][~np.isin(graph.factor_ids, factors), 2]

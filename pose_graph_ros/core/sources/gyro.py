@@ -21,7 +21,7 @@ that both claim.
 import bisect
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -105,9 +105,8 @@ class Agreement:
         self._products = np.zeros((4, 4))
         self._n = self._turned = 0.0
 
-    def add(
-        self, difference: float, seconds: float, change: float, angle: float, variance: float,
-    ) -> None:
+    def add(self, difference: float, seconds: float, change: float, angle: float,
+            variance: float) -> None:
         """
         Add a rotation, `angle` by the gyroscope and that less a difference by odometry.
 
@@ -160,10 +159,8 @@ class Agreement:
 STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
 
 
-def turn(
-    source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[float],
-    rest: Sequence[float],
-) -> list[Queued]:
+def turn(source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[float],
+         rest: Sequence[float]) -> list[Queued]:
     """
     Return the constraints of a rotation from one hidden node to the next.
 
@@ -183,8 +180,7 @@ def turn(
     return queued
 
 
-@dataclass(frozen=True, slots=True)
-class SavedGyro:
+class SavedGyro(NamedTuple):
     """Saved state of a gyroscope."""
 
     rates: tuple[YawRate, ...]  # from the last node on that was reached
@@ -276,9 +272,8 @@ class Gyros:
     no part of that, and the mean rate measures the bias instead.
     """
 
-    def __init__(
-        self, nodes: HiddenNodes, config: BackendConfig, counts: Counter[tuple[str, str]],
-    ) -> None:
+    def __init__(self, nodes: HiddenNodes, config: BackendConfig,
+                 counts: Counter[tuple[str, str]]) -> None:
         self._nodes, self._config = nodes, config
         self.streams: dict[str, GyroStream] = {}  # by the name of the source
         # among them numbers of rotations by source: 'rotations' that were made, those that a 'gap'
@@ -366,9 +361,8 @@ class Gyros:
         found = {source: each.agreement.difference() for source, each in self.streams.items()}
         return {source: each for source, each in found.items() if each is not None}
 
-    def newest(
-        self, start_ns: int, end_ns: int, biases: Mapping[str, float],
-    ) -> tuple[float, float] | None:
+    def newest(self, start_ns: int, end_ns: int,
+               biases: Mapping[str, float]) -> tuple[float, float] | None:
         """
         Return the rotation of the robot between two recent stamps, and its variance.
 

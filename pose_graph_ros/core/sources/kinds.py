@@ -9,8 +9,7 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 import zlib
 
 import numpy as np
@@ -26,8 +25,7 @@ from pose_graph_ros.core.sources import validation
 from pose_graph_ros.core.sources.queued import Queued
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasurementKind:
+class MeasurementKind(NamedTuple):
     """
     What the engine asks of a kind of measurements.
 
@@ -106,9 +104,8 @@ def _observe_fix(fix: ms.Fix, source: str, at: Attachment, _: HiddenNodes) -> Qu
     return observed(source, position, at)
 
 
-def _join(
-    closure: ms.LoopClosure, source: str, at: Attachment, nodes: HiddenNodes,
-) -> Queued | ms.Answer:
+def _join(closure: ms.LoopClosure, source: str, at: Attachment,
+          nodes: HiddenNodes) -> Queued | ms.Answer:
     node, reference_ns = closure.reference_node, closure.reference_ns
     if reference_ns is not None:
         reference = attach(nodes, reference_ns)
@@ -204,9 +201,8 @@ def loop_closure_constraint(given: ms.LoopClosure, first: Attachment, at: Attach
     return Factors([first.node], [at.node], [mean], [information], [FactorKind.LOOP_CLOSURE])
 
 
-def closure_covariance(
-    own: FloatArray, pose: FloatArray, reference: Attachment, attachment: Attachment,
-) -> FloatArray:
+def closure_covariance(own: FloatArray, pose: FloatArray, reference: Attachment,
+                       attachment: Attachment) -> FloatArray:
     """Return the covariance of a closure with that of the motions since its nodes."""
     back, out = se2.adjoint(se2.inverse(pose)), se2.adjoint(attachment.motion)
     return np.asarray(out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)

@@ -118,9 +118,8 @@ class Beacons:
             self._counts[dropped.queued.source, 'dropped_unlocated'] += 1
         del ranges[:-MOST_WAITING]
 
-    def take_ready(
-        self, graph: Graph, apply: Callable[[GraphUpdate], bool], *, aligned: bool,
-    ) -> list[Queued]:
+    def take_ready(self, graph: Graph, apply: Callable[[GraphUpdate], bool], *,
+                   aligned: bool) -> list[Queued]:
         """
         Take the ranges that can be added to the graph, after making the landmarks for them.
 

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The numbers by which measurements are kept, and how well they fit is reported."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class SourceSettings:
+class SourceSettings(NamedTuple):
     """Meaning and unit of each number stand beside it."""
 
     # --- memory, where a sender's clock is ahead or the robot is not aligned for days

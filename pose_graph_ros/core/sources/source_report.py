@@ -109,10 +109,8 @@ class SourceReport(NamedTuple):
                 and self.energy > SOURCES.least_energy)
 
 
-def report(
-    graph: Graph, stamps_ns: IntArray, ids: IntArray, *, in_use: CorrelatedErrors | None,
-    found: bool = False,
-) -> SourceReport:
+def report(graph: Graph, stamps_ns: IntArray, ids: IntArray, *, in_use: CorrelatedErrors | None,
+           found: bool = False) -> SourceReport:
     """
     Return how well the newest measurements of a source fit the estimate.
 

@@ -105,10 +105,8 @@ def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, lis
     return cov, []
 
 
-def _finished(
-    measurement: ms.GlobalPose | ms.Position | ms.LoopClosure | ms.Fix, cov: FloatArray,
-    repairs: list[str], policy: CovariancePolicy,
-) -> Checked:
+def _finished(measurement: ms.GlobalPose | ms.Position | ms.LoopClosure | ms.Fix, cov: FloatArray,
+              repairs: list[str], policy: CovariancePolicy) -> Checked:
     """Return a measurement with a covariance that is repaired, scaled and within the bounds."""
     defect = covariance.defect(cov)
     if defect is not None:

@@ -24,8 +24,9 @@ is common to both: small where the part is short against the time constant of th
 """
 
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order
@@ -38,8 +39,7 @@ from pose_graph_ros.core.marginalization import marginalize as mg
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """When and how much leaves at once, and how sparse the rest becomes."""
 
     # a window: nodes leave in groups of this share of it, the newest few stay, and what is needed

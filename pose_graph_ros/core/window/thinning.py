@@ -41,9 +41,8 @@ class Segment(NamedTuple):
 def carriers(graph: Graph) -> IntArray:
     """Return the pose, by id, that holds each factor as a measurement; -1 if it is none."""
     factors, is_pose = graph.factors, graph.is_pose
-    measures = is_pose[graph.node_rows(factors.i)] & (
-        (factors.kind == FactorKind.BIAS)
-        | ((factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
+    measures = is_pose[graph.node_rows(factors.i)] & ((factors.kind == FactorKind.BIAS) | (
+        (factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
     # a rotation, and odometry that is calibrated, is held by the later one of its poses
     return np.where(measures, factors.i, np.where(
         factors.k >= 0, np.maximum(factors.i, factors.j), -1))
@@ -106,9 +105,8 @@ def _near(graph: Graph, poses: IntArray) -> dict[int, set[int]]:
     return neighbours(poses, ends[used])
 
 
-def crowded(
-    poses: Poses, preferred: BoolArray, config: ThinningConfig, part: int = LIMITS.compared,
-) -> IntArray:
+def crowded(poses: Poses, preferred: BoolArray, config: ThinningConfig,
+            part: int = LIMITS.compared) -> IntArray:
     """
     Return rows of poses that leave, ascending, each with that of its anchor, shape (L, 2).
     """
@@ -178,10 +176,8 @@ class Thinning:
         # with about one for each node that comes before the next look
         return n_measured + LIMITS.every > LIMITS.measurements * self._n_stay
 
-    def places(
-        self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int, keep: IntArray,
-        first: int,
-    ) -> Places | None:
+    def places(self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int,
+               keep: IntArray, first: int) -> Places | None:
         """
         Return the nodes from a first one on that leave now, maybe none; None most times.
 
@@ -218,9 +214,8 @@ def groups(graph: Graph, places: Places) -> Iterator[Places]:
         places = places.rows(~inside)
 
 
-def certain(
-    smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray, config: ThinningConfig,
-) -> Places:
+def certain(smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray,
+            config: ThinningConfig) -> Places:
     """
     Return the places of those nodes which are beside their anchors for sure.
 

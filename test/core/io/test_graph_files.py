@@ -229,7 +229,7 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
     losses = deepcopy(saved.losses)
     losses['id'][:] *= 3
     with_gaps = replace(
-        saved, nodes=replace(nodes, ids=2 * nodes.ids + 5), rows=rows._replace(
+        saved, nodes=nodes._replace(ids=2 * nodes.ids + 5), rows=rows._replace(
             factors=rows.factors.renumbered(lambda ids: 2 * ids + 5),
             node_ids=2 * rows.node_ids + 5, factor_ids=3 * rows.factor_ids,
             next_ids=NextIds(1000, 1000)),

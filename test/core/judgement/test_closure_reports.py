@@ -158,7 +158,7 @@ def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Rob
 def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(closures, 'BELIEF', replace(BELIEF, most_waiting=6))
+    monkeypatch.setattr(closures, 'BELIEF', BELIEF._replace(most_waiting=6))
     # each is so far off that none agrees with another one
     backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
     total = backend.verdict_totals()['loop']

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an update leaves to the work after it: closures it diverges with, tests of large graphs."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,7 +137,7 @@ DIVERGING = np.array([20.0, 60.0, 2.0])
 def test_closures_that_an_update_diverges_with_are_believed_after_it(
     monkeypatch: pytest.MonkeyPatch, *, in_update: bool,
 ) -> None:
-    monkeypatch.setattr(closure_judge, 'BELIEF', replace(BELIEF, large=600 if in_update else 500))
+    monkeypatch.setattr(closure_judge, 'BELIEF', BELIEF._replace(large=600 if in_update else 500))
     backend, smoother, poses = driven(600)
     add_group(backend, poses, DIVERGING, 6)
     odometry = backend.graph.poses[-1].copy()

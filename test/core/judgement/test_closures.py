@@ -13,7 +13,7 @@ from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePol
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.judgement.verdicts import Decision, State
+from pose_graph_ros.core.judgement.verdicts import Decision, DOUBTED, State
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample
 
 SECOND = 10**9
@@ -211,7 +211,7 @@ def test_closures_may_leave_while_a_better_set_is_looked_for(n_parts: int) -> No
     judge = backend._judge._closures
     states = judge.states
     # all are left out, as if none had been tested, so that there is something to look for
-    judge._change(dict.fromkeys(np.flatnonzero(states.in_graph).tolist(), State.DOUBTED))
+    judge._change(dict.fromkeys(np.flatnonzero(states.in_graph).tolist(), DOUBTED))
     job = judge._searched()
     for _ in range(n_parts):
         next(job, None)

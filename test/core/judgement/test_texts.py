@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts in words."""
 
-from dataclasses import replace
 from itertools import product
 import json
 import math
@@ -24,21 +23,22 @@ def test_a_sentence_says_state_and_reason() -> None:
         'Doubted and not used since 1700.500: it was 14.2 sigma from the path without it; it '
         'contradicts loop_closure/3.')
     # odometry is the path without it, which is not far
-    assert sentence(replace(CLOSURE, distance=0.04, contradicted_by=())) == (
+    assert sentence(CLOSURE._replace(distance=0.04, contradicted_by=())) == (
         'Doubted and not used since 1700.500: by itself it could be right, 0.0 sigma from the '
         'path without it, but all others together agree better without it.')
     # of a fix, what was expected when it came may have been as wrong
-    fix = replace(CLOSURE, kind=Judged.FIX, distance=0.04, contradicted_by=('odometry',),
-                  supported_by=('fix/3', 'fix/4'), residual=np.array([4.0, -3.0, math.nan]))
+    fix = CLOSURE._replace(
+        kind=Judged.FIX, distance=0.04, contradicted_by=('odometry',),
+        supported_by=('fix/3', 'fix/4'), residual=np.array([4.0, -3.0, np.nan]))
     assert sentence(fix) == ('Doubted and not used since 1700.500: it is 5 m from the path that '
                              'the others tell; fix/3, fix/4 agree with it.')
-    assert 'it is 5 m and 0.20 rad from' in sentence(replace(fix, residual=CLOSURE.residual))
-    assert sentence(replace(
-        CLOSURE, state=State.BELIEVED, distance=1.0, supported_by=('loop_closure/3',),
+    assert 'it is 5 m and 0.20 rad from' in sentence(fix._replace(residual=CLOSURE.residual))
+    assert sentence(CLOSURE._replace(
+        state=State.BELIEVED, distance=1.0, supported_by=('loop_closure/3',),
         contradicted_by=())) == (
         'Believed and used since 1700.500: it was 1.0 sigma from the path without it; '
         'loop_closure/3 agrees with it.')
-    assert sentence(replace(CLOSURE, decision=Decision.OUT)).startswith(
+    assert sentence(CLOSURE._replace(decision=Decision.OUT)).startswith(
         'Not used since 1700.500, as a person has decided')
 
 
@@ -47,11 +47,11 @@ def test_a_sentence_says_state_and_reason() -> None:
 def test_every_state_has_a_sentence_of_its_own(
     state: State, decision: Decision, distance: float,
 ) -> None:
-    verdict = replace(CLOSURE, state=state, decision=decision, distance=distance)
+    verdict = CLOSURE._replace(state=state, decision=decision, distance=distance)
     text = sentence(verdict)
     assert 'nan' not in text
     assert text.endswith('.')
-    others = {sentence(replace(verdict, state=other)) for other in State if other is not state}
+    others = {sentence(verdict._replace(state=other)) for other in State if other is not state}
     assert (text in others) == (decision is not Decision.AUTO)
 
 
@@ -64,7 +64,7 @@ def test_numbers_for_people_have_no_exponents(value: float, digits: int, text: s
 
 
 def test_as_json_has_numbers_and_no_nan() -> None:
-    found = as_json(replace(CLOSURE, residual=np.array([1.0, 2.0, np.nan]), distance=math.inf))
+    found = as_json(CLOSURE._replace(residual=np.array([1.0, 2.0, np.nan]), distance=math.inf))
     assert found['residual'] == [1.0, 2.0, None]
     assert found['distance'] is None
     assert found['contradicted_by'] == ['loop_closure/3', 'odometry']

@@ -14,7 +14,7 @@ from pose_graph_ros.core.geometry.covariance import propagated
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
-from pose_graph_ros.core.odometry.node_table import ThinnedNodes
+from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.sources.kinds import attach
 
 SECOND = 1_000_000_000
@@ -123,34 +123,36 @@ def test_between_the_last_that_left_and_the_next_odometry_leads_backwards() -> N
 def test_places_are_passed_on_from_anchor_to_anchor(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 30
-    kept, nodes = set(range(n)), ThinnedNodes()
+    kept, nodes = set(range(n)), NodeTable()
+    for number in range(n):
+        nodes.append(number, number, np.zeros(3))
     steps: dict[int, tuple[int, FloatArray, FloatArray]] = {}
     for _ in range(4):
         leaving = rng.choice(sorted(kept - {0}), 6, replace=False)
         kept -= set(leaving.tolist())
         anchors = rng.choice(sorted(kept), 6)
         relative, noise = random_poses(rng, 6), random_information(rng, 6)
-        nodes.add(leaving, anchors, relative, noise)
+        nodes.thin(leaving, anchors, relative, noise)
         steps |= {int(node): (int(anchor), mean, C) for node, anchor, mean, C in zip(
             leaving, anchors, relative, noise, strict=True)}
-    assert len(nodes) == len(steps)
+    assert nodes.n_thinned == len(steps)
     if seed % 2 == 0:   # else each place is passed on for itself
         assert nodes.places()['numbers'].tolist() == sorted(steps)
     for number in range(n):
-        place = nodes.place(number)
+        place = nodes.attachment(number, np.zeros(3), np.zeros((3, 3)))
+        assert nodes.has_left(number) == (number not in kept)
         if number in kept:
-            assert place is None
+            assert place.node == number
             continue
-        assert place is not None
         chain = [steps[number]]
         while chain[-1][0] not in kept:
             chain.append(steps[chain[-1][0]])
         mean, C = np.zeros(3), np.zeros((3, 3))
         for _, step, noise_ in reversed(chain):
             mean, C = se2.compose(mean, step), at_the_end(mean, C, step, noise_)
-        assert place.anchor == chain[-1][0]
+        assert place.node == chain[-1][0]
         np.testing.assert_allclose(
-            se2.between(place.mean, mean), 0.0, atol=1e-5)   # single precision
+            se2.between(place.motion, mean), 0.0, atol=1e-5)   # single precision
         np.testing.assert_allclose(place.noise, C, rtol=1e-5, atol=1e-4 * np.max(np.abs(C)))
 
 

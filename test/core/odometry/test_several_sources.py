@@ -22,7 +22,7 @@ def stream(stamps_ns: Iterable[int], settled_ns: int = -1) -> OdometryStream:
     one = OdometryStream(OdometrySource())
     for stamp_ns in stamps_ns:
         one.add(OdometrySample(stamp_ns, np.array([0.02 * stamp_ns, 0.0, 0.0])))
-    one.settle_all(settled_ns)
+    list(one.settle(settled_ns))
     return one
 
 
@@ -59,7 +59,7 @@ def test_samples_at_rest_that_were_left_out_end_no_silence() -> None:
     wheel = OdometryStream(OdometrySource())
     for stamp_ns in (10, 40, 70, 100):
         wheel.add(OdometrySample(stamp_ns, np.zeros(3)))
-    wheel.settle_all(100)
+    list(wheel.settle(100))
     assert wheel.timeline.stamps_ns.tolist() == [10, 100]
     streams = {'wheel': wheel, 'visual': stream([95])}
     assert find_silence(
@@ -79,7 +79,7 @@ def filled(times: Iterable[float]) -> OdometryStream:
         one.add(OdometrySample(
             round(t * 1e9), np.array([10.0 * np.sin(0.1 * t), 10.0 - 10.0 * np.cos(0.1 * t),
                                       0.1 * t])))
-    one.settle_all(one.newest_ns)
+    list(one.settle(one.newest_ns))
     return one
 
 
@@ -90,7 +90,7 @@ def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:
     after.restore(before.saved(NODES[:4]))
     for t in np.arange(4.6, 10.5, 0.1):      # 1 km away: this is no motion of the robot
         after.add(OdometrySample(round(t * 1e9), np.array([1000.0 + t, 0.0, 0.0])))
-    after.settle_all(after.newest_ns)
+    list(after.settle(after.newest_ns))
     assert NODES[3] < after.restarted_ns <= NODES[4]
     # the edges connect consecutive nodes after it
     assert [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for edge in after.secondary_edges(

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What happens to measurements before they are in the graph: thinned, dropped, placed."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,7 +36,7 @@ def test_a_source_can_be_thinned_by_stamps() -> None:
 
 
 def test_while_unaligned_the_oldest_positions_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_unaligned=50))
+    monkeypatch.setattr(pipeline, 'SOURCES', SOURCES._replace(most_unaligned=50))
     backend, rng = PoseGraphBackend(), np.random.default_rng(0)
 
     def drive(seconds: range, speed: float, x: float) -> float:
