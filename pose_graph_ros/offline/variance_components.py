@@ -38,13 +38,7 @@ from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
 from pose_graph_ros.offline import source_residuals
-from pose_graph_ros.offline.source_residuals import (
-    inverse,
-    ScaleFit,
-    SourceResiduals,
-    UNKNOWN,
-    Whiteness,
-)
+from pose_graph_ros.offline.source_residuals import inverse, ScaleFit, SourceResiduals, UNKNOWN
 
 # Random signs for each trace: its error is half of that of the squares that it is compared to.
 PROBES = 4
@@ -215,7 +209,7 @@ class Analysis(NamedTuple):
 
     residuals: SourceResiduals  # at the estimate
     fit: ScaleFit  # how large they are, with the factors of all sources in one estimate
-    whiteness: Whiteness | None
+    whiteness: source_residuals.Whiteness | None
     # whether it has correlated errors that the graph takes for independent: the residuals do not
     # show how large these are, and what those of other sources show may be because of them
     correlated: bool
