@@ -189,7 +189,7 @@ class Tuning:
             parts, by_residuals = engine.parts, dict[str, ScaleFit]()
             if len(self._closures) > 0 or any(
                     len(_heading_variances(some)) > 0 for some in self._sources.values()):
-                by_residuals |= analyse(parts).fits
+                by_residuals |= {source: each.fit for source, each in analyse(parts).items()}
             found: dict[str, Noise] = {}
             for source, some in self._sources.items():
                 is_placed = not all(isinstance(each, HeadingOnly) for each in some)

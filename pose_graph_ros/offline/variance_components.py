@@ -205,16 +205,17 @@ def _statistics(data: Constraints, total: FloatArray, roots: FloatArray, ranks: 
 
 
 class Analysis(NamedTuple):
-    """The residuals of each source, and how large its true sigmas are."""
+    """The residuals of a source, and how large its true sigmas are."""
 
-    residuals: dict[str, SourceResiduals]  # at the estimate
-    fits: Mapping[str, ScaleFit]  # how large they are, with the factors of all in one estimate
-    # Sources with correlated errors that the graph takes for independent: the residuals do not
-    # show how large these are, and what those of other sources show may be because of them.
-    correlated: frozenset[str]
+    residuals: SourceResiduals  # at the estimate
+    fit: ScaleFit  # how large they are, with the factors of all sources in one estimate
+    whiteness: source_residuals.Whiteness | None
+    # whether it has correlated errors that the graph takes for independent: the residuals do not
+    # show how large these are, and what those of other sources show may be because of them
+    correlated: bool
 
 
-def analyse(parts: Parts) -> Analysis:
+def analyse(parts: Parts) -> dict[str, Analysis]:
     """
     Return the residuals of each source, and the factors on sigmas that they show together.
 
@@ -230,11 +231,13 @@ def analyse(parts: Parts) -> Analysis:
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
-    correlated = frozenset(source for source, each in white.items() if each.kind == 'map' and (
-        found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
+    series = {source: source_residuals.whiteness(each) for source, each in residuals.items()}
+    correlated = {source for source, each in white.items() if each.kind == 'map' and (
+        found := series[source]) is not None and found.tau > 0.0}
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)
-    return Analysis(residuals, fits, correlated)
+    return {source: Analysis(each, fits[source], series[source], source in correlated)
+            for source, each in residuals.items()}
 
 
 def _together(parts: Parts, at_estimate: Mapping[str, ScaleFit],

@@ -89,7 +89,7 @@ def test_whiteness_tells_the_correlation_time_of_correlated_errors_alone() -> No
     assert whiteness(made(np.ones((10, 2)), 1.0)) is None
 
 
-def analysed(settings: dict[str, float], **drive: float) -> Analysis:
+def analysed(settings: dict[str, float], **drive: float) -> dict[str, Analysis]:
     measurements = HonestDrive(2, **drive).measurements()  # type: ignore[arg-type]
     return analyse(run(measurements, checked(settings)).backend.parts)
 
@@ -98,17 +98,17 @@ def analysed(settings: dict[str, float], **drive: float) -> Analysis:
 def test_all_sources_together_tell_which_one_is_wrong(wrong: str, ratio: float) -> None:
     found = analysed({'global_pose.correlation_time': 0.0}, **{wrong: ratio}, closures=0)
     source = {'times': 'global_pose', 'odometry_times': 'odom'}[wrong]
-    assert found.fits[source].ratio == pytest.approx(ratio, rel=0.25)
+    assert found[source].fit.ratio == pytest.approx(ratio, rel=0.25)
     for other in {'global_pose', 'odom'} - {source}:
-        assert found.fits[other].ratio == pytest.approx(1.0, abs=0.2)
+        assert found[other].fit.ratio == pytest.approx(1.0, abs=0.2)
     true = {'global_pose': 1.0, 'odom': 1.0} | {source: ratio}
     # each by itself, the other one seems to be wrong as well, or the wrong one better
-    alone = {name: fit(each) for name, each in found.residuals.items()}
+    alone = {name: fit(each.residuals) for name, each in found.items()}
     together, apart = (sum(abs(math.log(fits[name].ratio / true[name])) for name in true)
-                       for fits in (found.fits, alone))
+                       for fits in ({name: each.fit for name, each in found.items()}, alone))
     # and both say the same of what is claimed
     for name, each in alone.items():
-        assert [row.sigma for row in found.fits[name].rows] == pytest.approx(
+        assert [row.sigma for row in found[name].fit.rows] == pytest.approx(
             [row.sigma for row in each.rows], rel=1e-3)
     assert together < apart
-    assert not found.correlated
+    assert not any(each.correlated for each in found.values())

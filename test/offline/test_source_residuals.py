@@ -55,7 +55,7 @@ def test_what_the_fit_takes_is_that_of_dense_matrices() -> None:
     graph = backend.graph
     jacobian, covariance = dense(graph)
     taken = np.einsum('mia,ab,mjb->mij', jacobian, covariance, jacobian)
-    found = analyse(backend.parts).residuals
+    found = {source: each.residuals for source, each in analyse(backend.parts).items()}
     assert {source: each.kind for source, each in found.items()} == {
         'global_pose': 'map', 'odom': 'odometry', 'loop_closure': 'loop_closure'}
     for each in found.values():
@@ -77,7 +77,7 @@ def test_of_correlated_errors_the_whole_error_counts() -> None:
     backend = engine(20.0, tau=20.0)
     graph = backend.graph
     assert np.any(graph.is_bias)
-    found = analyse(backend.parts).residuals['global_pose']
+    found = analyse(backend.parts)['global_pose'].residuals
     assert np.all(graph.factors_at(found.ids).j >= 0)
     assert np.all(found.measured == (True, True, False))
     # the error of a fix is its place less that of its node, whatever the bias explains
@@ -103,9 +103,10 @@ def test_the_energies_of_honest_measurements_are_as_expected() -> None:
     """Chi-square calibration: the sum over drives is within four standard deviations."""
     sums: dict[str, list[tuple[float, float]]] = {}
     for seed in range(8):
-        for source, each in analyse(engine(0.0, seed).parts).residuals.items():
+        for source, found in analyse(engine(0.0, seed).parts).items():
+            each = found.residuals
             sums.setdefault(source, []).append(
                 (float(np.sum(each.energies)), float(np.sum(each.redundancies))))
     for source, pairs in sums.items():
-        found, expected = np.sum(pairs, axis=0)
-        assert abs(found - expected) < 4.0 * np.sqrt(2.0 * expected), source
+        energy, expected = np.sum(pairs, axis=0)
+        assert abs(energy - expected) < 4.0 * np.sqrt(2.0 * expected), source

@@ -30,7 +30,7 @@ from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, Verdict
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.offline import pattern as patterns, variance_components
+from pose_graph_ros.offline import pattern as patterns
 from pose_graph_ros.offline.source_residuals import spread
 
 REFUSED_SOMEHOW = 'Refused; the counts of its source say why.'
@@ -70,8 +70,7 @@ def document(run: Run) -> dict[str, Any]:
     frame = Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
     verdicts = {(each.source, each.stamp_ns, each.reference_ns): each for each in run.verdicts}
     errors = _errors(drive, run.covariances, frame)
-    analysis = variance_components.analyse(run.backend.parts)
-    analyses = analyse(run, analysis)
+    analyses = analyse(run)
     lines, at_ns = _lines(drive, frame)
     start, updates = np.datetime64(run.start_ns, 'ns'), None
     whole, factor = (of(run.backend.graph) for of in (patterns.hessian, patterns.factor))
@@ -97,7 +96,7 @@ def document(run: Run) -> dict[str, Any]:
         'error_table': [asdict(row) | {name: number(getattr(row, name), 5) for name in (
             'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
-        'springs': springs(run, analysis.residuals, frame),
+        'springs': springs(run, analyses, frame),
         'updates': updates, 'sparsity': [
             {'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': max(fill, 0),
              'bins': each.bins, 'cells': each.cells.tolist()} for title, each, fill in (

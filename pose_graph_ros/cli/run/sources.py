@@ -14,9 +14,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
-from pose_graph_ros.offline import source_residuals
+from pose_graph_ros.offline import source_residuals, variance_components
 from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, Whiteness
-from pose_graph_ros.offline.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
 
@@ -24,12 +23,12 @@ WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which 
 class SourceAnalysis(NamedTuple):
     """What the residuals of a source show."""
 
-    residuals: SourceResiduals
-    kind: Kind
+    residuals: SourceResiduals  # this and the next three as in `Analysis`
     fit: ScaleFit
     whiteness: Whiteness | None
+    correlated: bool
+    kind: Kind
     in_use: CorrelatedErrors | None  # that the graph is built with; None for white errors
-    correlated: bool  # whether its errors are, and the graph takes them for independent
     suspects: tuple[str, ...]  # others of which this is so: their errors may show in its residuals
     advice: str  # the parameter that makes its sigmas right, with its value
 
@@ -40,22 +39,23 @@ class SourceAnalysis(NamedTuple):
         return float(np.median(used)) if len(used) > 0 else 1.0
 
 
-def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
+def analyse(run: Run) -> dict[str, SourceAnalysis]:
     """Return the analysis of each source."""
+    shown = variance_components.analyse(run.backend.parts)
+    correlated = {source for source, each in shown.items() if each.correlated}
     guesses = {'odometry': ODOMETRY, 'loop_closure': LOOP_CLOSURE, 'turn': GYRO,
                'map': GLOBAL_POSE}
     reports, found = run.backend.reports(), {}
-    for source, each in analysis.residuals.items():
-        fit, report = analysis.fits[source], reports.get(source)
+    for source, each in shown.items():
+        fit, report = each.fit, reports.get(source)
         # other odometry than the primary one has no sigma_scale that is used
         advice = f'{source}.sigma_scale to {short(fit.ratio)}'
         if source != run.estimate.primary:
             factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
             advice = f'{source}.covariance_scale to {short(factor)}'
-        found[source] = SourceAnalysis(each, run.kinds.get(source, guesses[each.kind]), fit,
-                                       source_residuals.whiteness(each), None if report is None
-                                       else report.in_use, source in analysis.correlated,
-                                       tuple(sorted(analysis.correlated - {source})), advice)
+        found[source] = SourceAnalysis(
+            *each, run.kinds.get(source, guesses[each.residuals.kind]), None if report is None
+            else report.in_use, tuple(sorted(correlated - {source})), advice)
     return found
 
 
@@ -152,7 +152,8 @@ def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
                       f'for less than it could; {advice} would be right')
 
 
-def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> list[dict[str, Any]]:
+def springs(run: Run, analyses: dict[str, SourceAnalysis],
+            frame: Frame) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
     names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
@@ -163,10 +164,10 @@ def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> li
 
     for rank, each in enumerate(run.backend.largest_energies(10), 1):
         residual, expected = None, math.nan
-        source = residuals.get(each.source)
-        at = np.zeros(0, dtype=bool) if source is None else source.ids == each.number
+        source = analyses.get(each.source)
+        at = np.zeros(0, dtype=bool) if source is None else source.residuals.ids == each.number
         if source is not None and np.count_nonzero(at) == 1:
-            one = source.rows(at)
+            one = source.residuals.rows(at)
             residual, expected = one.errors[0], float(one.redundancies[0])
         ends = [place(stamps[node], path.poses[node, :2]) for node in each.nodes
                 if node < len(path)]
