@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms
+from pose_graph_ros.core import measurements as ms, saved_columns
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.stream import ReorderBuffer
-from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.gyro import Gyros
 from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
 from pose_graph_ros.core.sources.queued import Beacons, Queued, WaitingRange
@@ -32,8 +31,8 @@ class WaitingMeasurement(NamedTuple):
 class SavedStamps(NamedTuple):
     """Stamps of the measurements of a source that were seen [ns], ascending, and references."""
 
-    stamps_ns: Integers
-    references: Integers
+    stamps_ns: saved_columns.Integers
+    references: saved_columns.Integers
 
 
 class SeenStamps:

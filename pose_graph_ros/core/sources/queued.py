@@ -8,12 +8,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms
+from pose_graph_ros.core import measurements as ms, saved_columns
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.saved_columns import Pairs, Rows2
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
 
@@ -73,8 +72,8 @@ class SavedQueue(NamedTuple):
 
     sources: tuple[str, ...]
     factors: Factors
-    stamps_ns: Pairs  # of measurements and of the other ends of loop closures [ns]
-    noise: Rows2
+    stamps_ns: saved_columns.Pairs  # of measurements and of the other ends of loop closures [ns]
+    noise: saved_columns.Rows2
 
     @classmethod
     def of(cls, queue: list[Queued]) -> 'SavedQueue':
