@@ -17,24 +17,19 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.forgetting import Forgetting
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import graph_view
+from pose_graph_ros.core.graph import graph_view, reweighting
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.graph_files import SavedGraph
-from pose_graph_ros.core.judgement import verdicts as vd
-from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
-from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.judgement import judge, verdicts as vd
+from pose_graph_ros.core.odometry import hidden_nodes, motion
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources import factor_builder, source_report
 from pose_graph_ros.core.sources.kinds import attach, observed, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.queued import Queued
-from pose_graph_ros.core.sources.source_report import SourceReport
 
 
 class PoseGraphBackend:
@@ -59,12 +54,12 @@ class PoseGraphBackend:
         self._config = config or BackendConfig()
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self.graph = self._smoother.graph  # which only this object may change
-        self._nodes = HiddenNodes(self._config, self._make_node)
+        self._nodes = hidden_nodes.HiddenNodes(self._config, self._make_node)
         self.odometry = self._nodes.streams  # by source, to be read only
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
-        self._reweighting = Reweighting()
-        factors = self._factors = FactorBuilder(self._config, self._reweighting)
-        self._judge = Judge(self._smoother, self._reweighting, self._nodes, factors)
+        self._reweighting = reweighting.Reweighting()
+        factors = self._factors = factor_builder.FactorBuilder(self._config, self._reweighting)
+        self._judge = judge.Judge(self._smoother, self._reweighting, self._nodes, factors)
         self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
         self.verdict_changes = self._judge.changes
         self.gyro_biases = factors.gyro_rates
@@ -120,7 +115,7 @@ class PoseGraphBackend:
         jumps = sum(stream.n_jumps_seen for stream in self._nodes.streams.values())
         return jumps + 1_000_000_000 * self._nodes.n_primaries
 
-    def reports(self) -> dict[str, SourceReport]:
+    def reports(self) -> dict[str, source_report.SourceReport]:
         """Return for each source how well its measurements fit the estimate."""
         return self._factors.reports(self.graph)
 
@@ -165,7 +160,7 @@ class PoseGraphBackend:
         self.counts['solver', 'failed'] += result.status is Status.FAILED
         return result.status is not Status.FAILED
 
-    def _make_node(self, made: NewNode) -> int:
+    def _make_node(self, made: hidden_nodes.NewNode) -> int:
         """Append a hidden node to the graph; return its id, or -1 if the solver failed."""
         if made.information is None:
             first = self.graph.next_ids.node
@@ -235,7 +230,7 @@ class PoseGraphBackend:
         self._collect()
         self._pipeline.queue.append(observed(
             source, replace(given, stamp_ns=last_ns + 1, pose=now),
-            Attachment(node, np.zeros(3), np.zeros((3, 3)))))
+            motion.Attachment(node, np.zeros(3), np.zeros((3, 3)))))
         return ms.ACCEPTED
 
     def update(self) -> UpdateReport:
@@ -397,7 +392,7 @@ class PoseGraphBackend:
         """Return those at the path of the present estimate; see `core.parts`."""
         return parts.path_covariances(self.parts, estimate)
 
-    def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
+    def saved(self, datum: geodesy.MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `parts.capture`."""
         self._tuner.finish_change()
         return parts.capture(self.parts, self._newest_node_covariance, self._chi2, datum)

@@ -16,17 +16,14 @@ import math
 
 import numpy as np
 
+from pose_graph_ros.core import error_tuner, exceptions, measurements, transaction
 from pose_graph_ros.core.config import BackendConfig, ThinningConfig, WindowConfig, WindowPrior
-from pose_graph_ros.core.error_tuner import ErrorTuner
-from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph_update import Gone, GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Verdict
-from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.transaction import succeeds
 from pose_graph_ros.core.window import sparse_removal as sr, thinning as th
 
 
@@ -74,7 +71,7 @@ class Forgetting:
     computed from that, and if it succeeds, all owners are told the same (`_tell`).
     """
 
-    def __init__(self, tuner: ErrorTuner, parts: Parts) -> None:
+    def __init__(self, tuner: error_tuner.ErrorTuner, parts: Parts) -> None:
         self._tuner, self._parts = tuner, parts
         # pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
         # was frozen before the graph was aligned with the map; else None
@@ -134,7 +131,7 @@ class Forgetting:
         nodes = np.array(update.remove_nodes, dtype=np.int64)
         with_nodes = self._parts.graph.factors_on(nodes)
         gone = Gone(nodes, np.union1d(with_nodes, update.drop).astype(np.int64))
-        return gone if succeeds(self._parts.smoother, update) else None
+        return gone if transaction.succeeds(self._parts.smoother, update) else None
 
     def _step_of_thinning(self, config: ThinningConfig) -> None:
         """Let groups of nodes leave, or of old measurements in the map, if some are due."""
@@ -234,7 +231,7 @@ class Forgetting:
         if gone is None:
             try:
                 gone = parts.smoother.forget(leaving)
-            except GraphUpdateError:
+            except exceptions.GraphUpdateError:
                 parts.pipeline.counts['solver', 'failed'] += 1
                 self._rest = len(nodes) + sr.LIMITS.rest
                 return
@@ -250,5 +247,5 @@ class Forgetting:
             lost = [each for each in queue if not left.isdisjoint(each.nodes)]
             queue[:] = [each for each in queue if left.isdisjoint(each.nodes)]
             for each in lost:
-                parts.pipeline.count(each.source, rejected(
+                parts.pipeline.count(each.source, measurements.rejected(
                     'before_window', 'its hidden node left the graph before it was added'))

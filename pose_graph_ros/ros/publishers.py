@@ -34,8 +34,7 @@ from pose_graph_ros.adapters.conversions import Datum, frame, Message, stamp_ns
 from pose_graph_ros.core import alignment, measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict
-from pose_graph_ros.core.geometry import covariance as cov, se2
-from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.geometry import covariance as cov, se2, trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
@@ -256,7 +255,7 @@ def _key_values(values: Mapping[str, object]) -> list[KeyValue]:
     return [KeyValue(key=key, value=str(value)) for key, value in values.items()]
 
 
-def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
+def thinned(path: trajectory.Trajectory, n_frozen: int) -> trajectory.Trajectory:
     """
     Return a path with every n-th of its poses that have left the graph, from the first on.
 
@@ -266,7 +265,7 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
     if (step := -(-n_frozen // 20_000)) <= 1:
         return path
     kept = np.concatenate((np.arange(0, n_frozen, step), np.arange(n_frozen, len(path))))
-    return Trajectory(path.stamps_ns[kept], path.poses[kept])
+    return trajectory.Trajectory(path.stamps_ns[kept], path.poses[kept])
 
 
 def _header(stamp_ns: StampNs, frame_id: str) -> Header:

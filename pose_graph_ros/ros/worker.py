@@ -28,13 +28,11 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
-from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.geometry import covariance, geodesy, se2
 from pose_graph_ros.core.io import graph_files
 from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
-from pose_graph_ros.core.sources.bias import Calibration
-from pose_graph_ros.core.sources.gyro import Difference
+from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import ANSWER, verdict_lines
 
@@ -65,9 +63,9 @@ class WorkerStatus:
     # what is believed of each
     verdicts: Mapping[str, SourceVerdicts] = field(default_factory=dict)
     biases: Mapping[str, float] = field(default_factory=dict)  # of gyroscopes [rad/s]
-    calibrations: Mapping[str, Calibration] = field(default_factory=dict)  # of odometries
+    calibrations: Mapping[str, bias.Calibration] = field(default_factory=dict)  # of odometries
     # of the rotations of each gyroscope from those of odometry
-    differences: Mapping[str, Difference] = field(default_factory=dict)
+    differences: Mapping[str, gyro.Difference] = field(default_factory=dict)
     n_changes: int = 0  # number of changes of verdicts
 
 
@@ -372,7 +370,7 @@ def graph_path(values: Mapping[str, Any]) -> Path:
         raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
 
 
-def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, MapOrigin | None]:
+def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOrigin | None]:
     """
     Return file and datum of the graph that a node starts with; None before one was saved.
 

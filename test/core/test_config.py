@@ -33,7 +33,7 @@ def test_no_setting_is_negative_or_not_finite(kind: type, name: str, value: floa
 
 
 @pytest.mark.parametrize(('kind', 'name', 'value'), [
-    (MeasurementSource, 'loss', 'huber'), (OdometrySource, 'loss', 1),
+    (MeasurementSource, 'loss', 'huber'), (MeasurementSource, 'loss', 1),
     (OdometrySource, 'noise_from', 'twist'),
     (CovariancePolicy, 'heading', Loss.NONE)])
 def test_a_choice_is_a_member_of_its_enumeration(kind: type, name: str, value: object) -> None:

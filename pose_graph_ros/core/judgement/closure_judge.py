@@ -23,19 +23,17 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import closures as cl, verdicts as vd
+from pose_graph_ros.core.judgement import closures as cl, odometry_chain, verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
-from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.trial import continued
+from pose_graph_ros.core.smoother import incremental, trial
 from pose_graph_ros.core.sources.queued import Queued
 
 
 class ClosureJudge:
-    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting,
-                 chain: OdometryChain) -> None:
+    def __init__(self, smoother: incremental.IncrementalSmoother, reweighting: Reweighting,
+                 chain: odometry_chain.OdometryChain) -> None:
         self._smoother, self._reweighting, self._chain = smoother, reweighting, chain
         self.states = cl.ClosureTable(chain)
         self.redecision = Redecision(smoother)
@@ -253,7 +251,7 @@ class ClosureJudge:
         changed = np.array([*weights], dtype=np.int64)
 
         if (yield from self.redecision.tried(
-                weights, continued(graph, choice.poses, nodes),
+                weights, trial.continued(graph, choice.poses, nodes),
                 lambda: bool(np.all(states.judged[states.numbers(changed)])))):
             self._note(self._changes_to(changed, believed))
 
@@ -269,7 +267,7 @@ class ClosureJudge:
             states.in_graph[judged], self._reweighting))
         if choice is None:
             return
-        graph.set_poses(continued(graph, choice.poses))
+        graph.set_poses(trial.continued(graph, choice.poses))
         changes = self._changes_to(decided, decided[choice.believed])
         if len(changes) > 0 and not self._change(changes, at_once=True):
             graph.set_poses(before)

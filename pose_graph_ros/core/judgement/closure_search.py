@@ -288,9 +288,7 @@ class Redecision:
         """Do a part of the job; tell whether there was one."""
         if self.job is None:
             return False
-        try:
-            next(self.job)
-        except StopIteration:
+        if next(self.job, self) is self:
             self.job = None
         return True
 

@@ -16,25 +16,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import config, saved_columns
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import Loss, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import verdicts as vd
+from pose_graph_ros.core.judgement import fix_states, odometry_chain, settings, verdicts as vd
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
-from pose_graph_ros.core.judgement.fix_states import OdometryStates
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.judgements import LEFT, MOST_OTHERS, SavedVerdicts
-from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.queued import Queued
@@ -43,11 +39,12 @@ from pose_graph_ros.core.sources.queued import Queued
 class SavedJudgement(NamedTuple):
     closures: SavedVerdicts
     fixes: SavedVerdicts
-    loosened: Integers  # ids of odometry edges that are believed less than claimed
-    weights: Numbers  # their weights
+    loosened: saved_columns.Integers  # ids of odometry edges that are believed less than claimed
+    weights: saved_columns.Numbers  # their weights
     # number of odometry edges of some sources that have left the graph doubted
     odometry_left: Mapping[str, int]
-    spread: Rows3  # pose and covariance of the hypotheses on fixes, see `Spread`
+    # pose and covariance of the hypotheses on fixes, see `Spread`
+    spread: saved_columns.Rows3
 
 
 class Judge:
@@ -56,9 +53,9 @@ class Judge:
     def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
                  factors: FactorBuilder) -> None:
         self._smoother, self._reweighting = smoother, reweighting
-        self._nodes, self._factors, self._chain = nodes, factors, OdometryChain()
+        self._nodes, self._factors, self._chain = nodes, factors, odometry_chain.OdometryChain()
         self.fixes = FixJudge(smoother, reweighting, nodes, factors, self._chain)
-        self._odometry = OdometryStates(nodes)
+        self._odometry = fix_states.OdometryStates(nodes)
         self._closures = closures = ClosureJudge(smoother, reweighting, self._chain)
         self.after, self.test, self.work = closures.after, closures.test, closures.work
         # solves the graph with some weights between the updates, as these diverge
@@ -80,7 +77,7 @@ class Judge:
         may_be = (factors.kind == FactorKind.LOOP_CLOSURE) & (factors.information[:, 0, 0] > 0.0)
         closures = [one for one in new if may_be[one.number - first]
                     and self._factors.config.measurement_source(
-                        one.source, LoopClosure).robust is Robust.JUDGED]
+                        one.source, LoopClosure).robust is config.Robust.JUDGED]
         if len(closures) == 0:
             return change
         self._staged = np.array([one.number - first for one in closures])
@@ -126,7 +123,7 @@ class Judge:
         later, wanted = dict[int, float](), dict(change.weigh)
         for one in self._new:
             if one.measured is LoopClosure or self._factors.config.measurement_source(
-                    one.source, one.measured).applied_loss is Loss.NONE:
+                    one.source, one.measured).applied_loss is config.Loss.NONE:
                 continue
             row = one.held - begin
             later[one.held] = wanted.pop(one.held, float(weights[row]))
@@ -140,7 +137,7 @@ class Judge:
     def may_solve(self) -> bool:
         """Tell whether an update that has diverged may solve for all at once."""
         redecision = self._closures.redecision
-        is_large = self._smoother.graph.n_nodes > BELIEF.large
+        is_large = self._smoother.graph.n_nodes > settings.BELIEF.large
         return not is_large and redecision.may_solve()
 
     @property

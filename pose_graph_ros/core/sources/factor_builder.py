@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
+from pose_graph_ros.core import measurements, saved_columns
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource
 from pose_graph_ros.core.geometry import se2
@@ -16,10 +17,8 @@ from pose_graph_ros.core.geometry.se2 import Covariance, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import NewNode
 from pose_graph_ros.core.odometry.motion import as_calibrated, AS_CLAIMED, OdometryErrors
-from pose_graph_ros.core.saved_columns import Column
 from pose_graph_ros.core.sources import bias as bs, source_report
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -42,9 +41,9 @@ class SourceState:
     given correlation time that edge is what it is added as.
     """
 
-    measured: Annotated[GrowingArray, Column(MEASURED)] = field(
+    measured: Annotated[GrowingArray, saved_columns.Column(MEASURED)] = field(
         default_factory=lambda: GrowingArray((), MEASURED))
-    edges: Annotated[GrowingArray, Column(EDGE)] = field(
+    edges: Annotated[GrowingArray, saved_columns.Column(EDGE)] = field(
         default_factory=lambda: GrowingArray((), EDGE))  # but those of primary odometry
     # of errors that are correlated, of a gyroscope, or of what an odometry is calibrated by
     bias: bs.BiasChain | None = None
@@ -175,7 +174,7 @@ class FactorBuilder:
     def commit(self) -> None:
         for new in self.new:
             state = self.sources.setdefault(new.source, SourceState())
-            if new.measured is LoopClosure:
+            if new.measured is measurements.LoopClosure:
                 state.edges.append_one((new.stamp_ns, new.number))
             else:
                 state.measured.append_one(
@@ -190,7 +189,7 @@ class FactorBuilder:
         for source, chain in self._chains.items():
             self.keep(source, chain)
 
-    def _settings(self, source: str, kind: type = GlobalPose) -> MeasurementSource:
+    def _settings(self, source: str, kind: type = measurements.GlobalPose) -> MeasurementSource:
         return self.config.measurement_source(source, kind)
 
     def _state(self, source: str) -> SourceState:

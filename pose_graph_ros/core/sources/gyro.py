@@ -32,9 +32,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import Answer, rejected, YawRate
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry import hidden_nodes, timeline
 from pose_graph_ros.core.odometry.stream import ReorderBuffer, stamp_of
-from pose_graph_ros.core.odometry.timeline import STANDING_NS
 from pose_graph_ros.core.sources.queued import Queued
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
@@ -156,7 +155,7 @@ class Agreement:
 
 
 # Parts of a standstill by the wheels in which the robot may still, or already, turn [ns].
-STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
+STOPPING_NS, STARTING_NS = timeline.STANDING_NS, timeline.STANDING_NS // 3
 
 
 def turn(source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[float],
@@ -272,7 +271,7 @@ class Gyros:
     no part of that, and the mean rate measures the bias instead.
     """
 
-    def __init__(self, nodes: HiddenNodes, config: BackendConfig,
+    def __init__(self, nodes: hidden_nodes.HiddenNodes, config: BackendConfig,
                  counts: Counter[tuple[str, str]]) -> None:
         self._nodes, self._config = nodes, config
         self.streams: dict[str, GyroStream] = {}  # by the name of the source
@@ -337,7 +336,7 @@ class Gyros:
         floor = self._config.odometry_source(primary).noise.sigma_floor_heading
         for first_ns, last_ns in odometry.timeline.rests(start_ns, end_ns):
             begin_ns, until_ns = first_ns + STOPPING_NS, last_ns - STARTING_NS
-            if until_ns - begin_ns < STANDING_NS:
+            if until_ns - begin_ns < timeline.STANDING_NS:
                 continue
             part = integral.between(begin_ns, until_ns)
             if abs(part.angle) <= most * part.seconds:

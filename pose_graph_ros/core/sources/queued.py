@@ -8,12 +8,11 @@ from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms
+from pose_graph_ros.core import measurements as ms, saved_columns
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, RECORD
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.saved_columns import Column, Numbers
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
 
@@ -26,11 +25,11 @@ class Queued(NamedTuple):
     """
 
     source: str
-    factor: Annotated[Factors, Column(RECORD)]  # one row
+    factor: Annotated[Factors, saved_columns.Column(RECORD)]  # one row
     stamp_ns: int = -1  # of the measurement [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
     # what the motion since the node adds to the variances of its position and heading
-    noise: Numbers = NO_NOISE
+    noise: saved_columns.Numbers = NO_NOISE
     number: int = -1  # its id in the graph, once it is in an update
     held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
 

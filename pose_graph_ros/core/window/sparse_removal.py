@@ -35,8 +35,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
-from pose_graph_ros.core.marginalization import marginalize as mg
-from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
+from pose_graph_ros.core.marginalization import marginalize as mg, sparsification
 
 
 class Limits(NamedTuple):
@@ -195,7 +194,7 @@ def sparse_removal(graph: Graph, nodes: IntArray, factors: IntArray = NONE) -> G
     prior = mg.marginal(graph, nodes, more.tolist(), cuts)
     try:
         told = [] if prior is None else [
-            sparsify(prior, n_extra=round(LIMITS.extra * len(prior.nodes))).factors]
+            sparsification.sparsify(prior, n_extra=round(LIMITS.extra * len(prior.nodes))).factors]
     except np.linalg.LinAlgError:
         return None
     return GraphUpdate(
@@ -224,7 +223,7 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     return update._replace(factors=Factors.joined(factors), priors=dense)
 
 
-def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
+def _of_window(graph: Graph, prior: Prior) -> sparsification.SparsePrior | None:
     """Return what stands for a prior that a window leaves; None if it has to stay dense."""
     rows = graph.node_rows(prior.nodes)
     is_pose = graph.is_pose[rows]
@@ -242,7 +241,7 @@ def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
             prior, nodes=prior.nodes[order], reference=prior.reference[order],
             information=prior.information[np.ix_(at, at)], vector=prior.vector[at])
     extra = min(LIMITS.window_extra, LIMITS.window_edges / n - 1.0)
-    return sparsify(
+    return sparsification.sparsify(
         prior, n_extra=round(extra * n), enough=LIMITS.window_enough, n_biases=n_biases)
 
 
