@@ -99,7 +99,7 @@ class ErrorTuner:
                 fixes.bank, fixes.known(), newest=BANK.most_learnt,
                 begins=() if self._in_use is None else (self._in_use,))
             self._next = fixes.n_seen + max(1, min(
-                int((BANK.next_learnt - 1.0) * fixes.n_seen), BANK.most_learnt // 6))
+                int((BANK.next_learnt - 1.0) * fixes.n_seen), BANK.most_learnt // 4))
         if self._search is not None:
             try:
                 next(self._search)

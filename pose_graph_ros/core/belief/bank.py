@@ -8,6 +8,7 @@ does not depend on the order of arrival.
 """
 
 from copy import copy
+from itertools import pairwise
 import math
 from typing import NamedTuple, Self
 
@@ -31,7 +32,8 @@ class Odometry(NamedTuple):
     nodes: IntArray  # ids, ascending, shape (N,)
     poses: FloatArray  # in the first one, shape (N, 3)
     sums: FloatArray  # upper triangles of the summed covariances up to them, shape (N, 6)
-    stamps_ns: IntArray  # shape (N,)
+    known: IntArray  # ids of these and of other nodes, ascending, shape (M,)
+    stamps_ns: IntArray  # of all known nodes, shape (M,)
     errors: OdometryErrors
 
 
@@ -90,7 +92,9 @@ class Bank:
         first = len(self)
         if first > 0 and int(self._rows.values[-1]['stamp_ns']) >= oldest:
             first = int(np.searchsorted(self._rows['stamp_ns'], oldest))
-        later = np.concatenate((self._rows.values[first:], new))
+        later = new
+        if first < len(self):
+            later = np.concatenate((self._rows.values[first:], new))
         # those of one stamp by their source, then by their values: not by the order of arrival
         order = np.lexsort(
             (later['mean'][:, 1], later['mean'][:, 0], later['source'], later['stamp_ns']))
@@ -114,9 +118,12 @@ class Bank:
         begins, ends = np.searchsorted(odometry.nodes, (from_node, rows['node'][at]))
         # where the chain does not reach there is none
         begins = np.where((from_node < 0) | (ends >= len(odometry.nodes)), ends, begins)
-        for row, begin, end in zip(at.tolist(), begins.tolist(), ends.tolist(), strict=True):
-            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns, errors, rows, row,
-                         begin, end)
+        some = slice(int(np.min(begins)), int(np.max(ends)) + 1)
+        stamps_ns = odometry.stamps_ns[np.searchsorted(odometry.known, odometry.nodes[some])]
+        poses, sums = odometry.poses[some], odometry.sums[some]
+        for row, begin, end in zip(at.tolist(), (begins - some.start).tolist(),
+                                   (ends - some.start).tolist(), strict=True):
+            join_motions(poses, sums, stamps_ns, errors, rows, row, begin, end)
         # slow errors change also while no node is passed
         at = at[at > 0]
         rows['lever'][at, 2] = 1e-9 * (rows['stamp_ns'][at] - rows['stamp_ns'][at - 1])
@@ -155,10 +162,13 @@ class Bank:
             self.done = end
             if end % BANK.checkpoint == 0:
                 self._kept[end] = self._bank[:self._n].copy()
-        if len(self._kept) > 4 * BANK.checkpoint:
-            old = sorted(self._kept)[1:len(self._kept) // 2]
-            for at in old[::2]:
+        last, *kept = sorted(self._kept)
+        for at, after in pairwise(kept):
+            # the older they are, the farther apart
+            if after - last < (n - at) // BANK.kept:
                 del self._kept[at]
+            else:
+                last = at
         return n < len(self)
 
     def decide(self) -> Decided:
@@ -215,7 +225,7 @@ class Bank:
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
         best = int(np.argmax(likely))
         likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
-        wider = np.zeros((len(some), 3, 3))
+        wider = None
         if np.any(in_fault[best]) or self._tree.values[-1, best]['choice'] != hy.GOOD:
             # something speaks for it that one was in a fault from the start; a small part that
             # hardly knows where the robot is would make the covariance useless
@@ -273,16 +283,20 @@ class Bank:
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 
-def added_covariance(likely: FloatArray, off: FloatArray, wider: FloatArray) -> FloatArray:
+def added_covariance(
+    likely: FloatArray, off: FloatArray, wider: FloatArray | None = None,
+) -> FloatArray:
     """
     Return what other poses add to the covariance of one, shape (3, 3), in [m, m, rad].
 
     Given are their probabilities, their differences from it, (N, 3), and by how much their own
-    covariances are larger, (N, 3, 3).
+    covariances are larger, (N, 3, 3), if they are.
     """
     off = se2.wrapped(off)
-    variances, axes = np.linalg.eigh(
-        (off.T * likely) @ off + np.einsum('n,nij', likely, wider))
+    added = (off.T * likely) @ off
+    if wider is None:
+        return np.asarray(added)
+    variances, axes = np.linalg.eigh(added + np.einsum('n,nij', likely, wider))
     return np.asarray((axes * np.maximum(variances, 0.0)) @ axes.T)
 
 

@@ -66,10 +66,12 @@ def measured(
     rows['offset'][biased, 2] = 0.0
     has_heading = np.where(biased, information[:, 2, 2] > 0.0, given.kind != FactorKind.POSITION)
     placed = information[:, 1, 1] > 0.0
-    # from the axes of measured poses to those of the map
-    axes = se2.adjoint(given.mean * (0.0, 0.0, 1.0) * ~biased[:, None])
     for n, which in ((2, placed & ~has_heading), (3, placed & has_heading)):
-        turned = axes[which, :n, :n]
+        if not np.any(which):
+            continue
+        # from the axes of measured poses to those of the map
+        turned = se2.adjoint(
+            given.mean[which] * (0.0, 0.0, 1.0) * ~biased[which, None])[:, :n, :n]
         noise = turned @ np.linalg.inv(information[which, :n, :n]) @ np.swapaxes(turned, 1, 2)
         rows['noise'][which] = noise[:, (0, 0, 1), (0, 1, 1)]
         if n == 3:

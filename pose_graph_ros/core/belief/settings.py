@@ -58,9 +58,9 @@ class BankSettings:
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
     # at which numbers of measurements noise is learnt: the first, and the ratio of the next one
     first_learnt: int = 10
-    next_learnt: float = 1.3
-    # newest ones that it is learnt from while measurements come, as soon as a sixth of them is new
-    most_learnt: int = 3000
+    next_learnt: float = 1.5
+    # newest ones that it is learnt from while measurements come, when a quarter of them is new
+    most_learnt: int = 2000
 
     # --- the bank
     hypotheses: int = 96  # at least 5 for each heading that is tried
@@ -73,9 +73,9 @@ class BankSettings:
     alike_spread: float = 10.0  # with variances within such a factor
     equal: float = 0.3  # within so many sigmas two become one
     period_ns: int = 1_000_000_000  # of each source one measurement in such a time decides [ns]
-    # rows from one state that is kept to the next; four times as many states are kept, of older
-    # ones every second is dropped
+    # rows from one state that is kept to the next; between old ones, such a part of their age
     checkpoint: int = 16
+    kept: int = 8
 
 
 BANK = BankSettings()

@@ -61,7 +61,7 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel, NUMBERS, ROWS
+from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, NUMBERS, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
@@ -330,16 +330,16 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
             + y * (w[3] * y + 2.0 * w[4] * th) + th * w[5] * th)
 
 
-@kernel(signature=(tb.HEAD, NUMBERS))
-def write_energies(head, out):  # type: ignore[no-untyped-def]
-    """Write the unweighted energies of all factors at the present poses [sigma^2]."""
+@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
+def write_energies(head, rows, out):  # type: ignore[no-untyped-def]
+    """Write the unweighted energies of the factors in some rows at the present poses [sigma^2]."""
     nodes = tb.nodes(head)
-    for e in range(head[tb.N_FACTORS]):
-        f = tb.factors(head)[e]
+    for n in range(len(rows)):
+        f = tb.factors(head)[rows[n]]
         kind, i, j, k = kind_and_ends(f)
         by_pose, _ = third(nodes, f, k)
         ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, by_pose)
-        out[e] = _form(f, ex, ey, eth)
+        out[n] = _form(f, ex, ey, eth)
 
 
 # --- constraints that need not be in a graph, at given poses -------------------------------------

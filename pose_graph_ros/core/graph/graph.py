@@ -14,7 +14,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Po
 from pose_graph_ros.core.graph import checks, editing, tables as tb, transaction_log
 from pose_graph_ros.core.graph.checks import Ids
 from pose_graph_ros.core.graph.constraints import FACTORS, Factors, full, NodeKind
-from pose_graph_ros.core.graph.factors import energies, errors
+from pose_graph_ros.core.graph.factors import energies, errors, write_energies
 from pose_graph_ros.core.graph.graph_update import Energies, Gone, GraphRows, GraphUpdate, NextIds
 from pose_graph_ros.core.graph.prior_rows import add_priors, priors_of
 from pose_graph_ros.core.graph.priors import model, Prior
@@ -121,6 +121,11 @@ class Graph:
     def factor_rows(self, ids: npt.ArrayLike) -> IntArray:
         """Return the rows of factors, as `node_rows`."""
         return self._ids('factor').rows(ids)
+
+    def first_factor_from(self, number: int) -> int:
+        """Return the row of the first factor with an id from one on."""
+        ids = self.memory['factor_id'][:self.n_factors]
+        return int(np.searchsorted(ids, ids.dtype.type(number)))
 
     def factors_on(self, nodes: IntArray) -> IntArray:
         """Return the ids of the factors with an end in some nodes."""
@@ -236,6 +241,12 @@ class Graph:
             energies(errors(poses, factors), factors.weighted_information),
             np.array([model(prior, poses[rows], self.is_pose[rows]).energy
                       for prior in self.priors for rows in (self.node_rows(prior.nodes),)]))
+
+    def unweighted_energies(self, rows: IntArray) -> FloatArray:
+        """Return the energies of the factors in some rows without their weights [sigma^2]."""
+        out = np.empty(len(rows))
+        write_energies(self.memory.head, rows, out)
+        return out
 
     def errors(self, factors: Factors, poses: Poses | None = None) -> FloatArray:
         """Return the errors of factors with ids for ends, in the graph or not."""

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Points
-from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 
@@ -130,6 +129,5 @@ class FactorTable(NamedTuple):
 
 def factor_table(graph: Graph) -> FactorTable:
     """Return the factors of a graph."""
-    energies = np.empty(graph.n_factors)
-    factors.write_energies(graph.memory.head, energies)
-    return FactorTable(graph.factor_records, energies)
+    return FactorTable(
+        graph.factor_records, graph.unweighted_energies(np.arange(graph.n_factors)))

@@ -39,7 +39,6 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.saved_columns import Column
 
@@ -199,8 +198,7 @@ class Reweighting:
         if len(index) == 0:
             return {}
         ids = self['id'][index]
-        some = graph.factors_at(ids)
-        energy, weight = energies(graph.errors(some), some.information), some.weight
+        energy, weight = _energies_and_weights(graph, ids)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in self._groups(index):
             _, wanted[chosen] = costs_and_weights(loss, energy[chosen], widened * threshold)
@@ -210,16 +208,25 @@ class Reweighting:
 
     def _groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
         """Return each pair of loss and threshold with the positions in `index` that have it."""
-        kinds, which = np.unique(
-            self.table.values[['loss', 'threshold']][index], return_inverse=True)
-        return [(_LOSSES[kind], threshold, np.flatnonzero(which == k))
-                for k, (kind, threshold) in enumerate(kinds.tolist())]
+        losses, thresholds = self['loss'][index], self['threshold'][index]
+        groups, left = [], np.arange(len(index))
+        while len(left) > 0:
+            loss, threshold = int(losses[left[0]]), float(thresholds[left[0]])
+            alike = (losses[left] == loss) & (thresholds[left] == threshold)
+            groups.append((_LOSSES[loss], threshold, left[alike]))
+            left = left[~alike]
+        return groups
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
-        total, some = 0.0, graph.factors_at(self['id'])
-        energy, weight = energies(graph.errors(some), some.information), some.weight
+        total, (energy, weight) = 0.0, _energies_and_weights(graph, self['id'])
         for loss, threshold, chosen in self._groups(np.arange(len(self))):
             costs, _ = costs_and_weights(loss, energy[chosen], threshold)
             total += float(np.sum(self['base'][chosen] * costs - weight[chosen] * energy[chosen]))
         return total
+
+
+def _energies_and_weights(graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the unweighted energies of factors, and their weights."""
+    rows = graph.factor_rows(ids)
+    return graph.unweighted_energies(rows), graph.factor_records['weight'][rows]

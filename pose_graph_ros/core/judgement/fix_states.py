@@ -47,21 +47,40 @@ class FixStates(Judgements):
         free = self.decision[which] == vd.AUTO
         self.state[which[free]] = np.where(believed[free], vd.BELIEVED, vd.DOUBTED)
 
-    def weights(self, before: IntArray, *, base: bool = False) -> dict[int, float]:
-        """Return weights that change, or `base` weights, by the ids of factors."""
-        changed, later = self.changed(before), np.empty(0, dtype=np.int64)
-        doubted = np.flatnonzero(~self.believed[len(before):]) + len(before)
-        again = self.stamps_ns[changed[self.believed[changed]], 0]
+    def weights(
+        self, size: int, numbers: IntArray, before: IntArray, *, base: bool = False,
+    ) -> dict[int, float]:
+        """
+        Return weights that change, or `base` weights, by the ids of factors.
+
+        There were so many records, and some had another state.
+        """
+        changed, later = self.changed(numbers, before), np.empty(0, dtype=np.int64)
+        doubted = np.flatnonzero(self.state[size:] != vd.BELIEVED) + size
+        again = self.stamps_ns[changed[self.state[changed] == vd.BELIEVED], 0]
         if not base and len(again) > 0:
             # losses have lowered the weights of the believed ones since one that returns
             later = np.flatnonzero((self.stamps_ns[:, 0] >= np.min(again)) & self.believed)
         which = np.concatenate((doubted, later, changed))
-        return dict(zip(self.held[which].tolist(), self.believed[which].astype(float).tolist(),
-                        strict=True))
+        believed = self.state[which] == vd.BELIEVED
+        return dict(zip(self.held[which].tolist(), believed.astype(float).tolist(), strict=True))
 
-    def changed(self, before: IntArray) -> IntArray:
-        """Return the numbers of records that had another state, given all that there were."""
-        return np.flatnonzero(self.state[:len(before)] != before)
+    def changed(self, numbers: IntArray, before: IntArray) -> IntArray:
+        """Return the numbers of those records that had another state."""
+        return numbers[self.state[numbers] != before]
+
+    def numbers_of(self, factors: IntArray) -> IntArray:
+        """Return the numbers of records by the ids they were added as, -1 where there is none."""
+        # mostly they are among the newest
+        first, oldest = len(self), np.min(factors, initial=np.iinfo(np.int64).max)
+        while first > 0 and self.added[first - 1] >= oldest:
+            first = max(2 * first - len(self) - 16, 0)
+        added = self.added[first:]
+        at = np.searchsorted(added, factors)
+        found = np.flatnonzero(np.append(added, -1)[at] == factors)
+        numbers = np.full(len(factors), -1)
+        numbers[found] = first + at[found]
+        return numbers
 
     def moved(self, before: IntArray, after: IntArray) -> None:
         """Have records follow measurements that other factors hold now; by ids."""

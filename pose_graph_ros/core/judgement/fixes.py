@@ -43,10 +43,12 @@ ROWS_IN_STEP = 50
 
 
 class _Decided(NamedTuple):
-    """What is decided on all measurements in the map, at some time."""
+    """What was decided before an update."""
 
-    run: IntArray
-    state: IntArray  # of each record, both of shape (M,)
+    size: int  # number of records
+    numbers: IntArray  # of those of them that are decided on anew, ascending, shape (M,)
+    state: IntArray
+    run: IntArray  # of each of these, both of shape (M,)
     loosened: Mapping[int, float]  # as in `FixJudge`
     slips: dict[int, tuple[int, int, float]]
 
@@ -80,7 +82,8 @@ class FixJudge:
                  and self._is_judged(one.source, one.measured) is not None}
         if len(by_id) == 0:
             return change
-        self._now_ns, before, graph = now_ns, self._begin(), self._smoother.graph
+        self._now_ns, graph = now_ns, self._smoother.graph
+        self._begin()
         self.prepare()
         ids = np.array([*by_id])
         rows = measured(change.factors.rows(ids - graph.next_ids.factor),
@@ -106,7 +109,7 @@ class FixJudge:
                               strict=True):
             if row_id in judged:
                 self.states.distance[judged[row_id]] = math.sqrt(d2)
-        return self._with_weights(change, before)
+        return self._with_weights(change)
 
     def _is_judged(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool | None:
         """Tell whether a source is judged; None if the bank does not even learn from it."""
@@ -148,11 +151,9 @@ class FixJudge:
 
     def odometry(self) -> Odometry:
         """Return the chain of odometry, with the errors that it knows of."""
-        chain = self._chain
+        chain, known = self._chain, self._nodes
         return Odometry(
-            chain.nodes, chain.poses, chain.sums,
-            self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, chain.nodes)],
-            self._nodes.errors)
+            chain.nodes, chain.poses, chain.sums, known.ids, known.stamps_ns, known.errors)
 
     def _records(self, source: str, least: float = BANK.least_sigmas[0]) -> Records:
         some = self._factors.sources[source].measured.values
@@ -225,10 +226,10 @@ class FixJudge:
         states, rows = self.states, self.bank.rows[decided.first:]
         if len(rows) == 0:
             return
-        added = np.append(states.added, -1)
-        numbers = np.searchsorted(added[:-1], rows['id'])
-        known = added[numbers] == rows['id']
+        numbers = states.numbers_of(rows['id'])
+        known = numbers >= 0
         numbers = numbers[known]
+        self._decide_on(numbers)
         choice = decided.choice
         if decided.first == 0 and not _determines(rows[is_believed(choice)]):
             choice = np.full(len(rows), GOOD)
@@ -258,47 +259,58 @@ class FixJudge:
             if choice[row] == BEGINS or (choice[row] == GOES_ON and source not in begun):
                 begun[source] = one
                 if choice[row] == GOES_ON:  # it has begun before the first row
-                    earlier = np.flatnonzero(self.bank.rows['source'][:first] == source)[-1:]
-                    at = np.searchsorted(states.added, self.bank.rows['id'][earlier])
-                    at = at[at < len(states)]
-                    if len(at) > 0 and states.run[at[0]] > 0:
+                    earlier = first - 1
+                    while earlier >= 0 and self.bank.rows['source'][earlier] != source:
+                        earlier -= 1
+                    at = states.numbers_of(self.bank.rows['id'][earlier:first][:1])
+                    if len(at) > 0 and at[0] >= 0 and states.run[at[0]] > 0:
                         begun[source] = int(states.run[at[0]])
             elif choice[row] not in (ALONE, GOES_ON):
                 begun.pop(source, None)
             runs[row] = LONE if choice[row] == ALONE else begun.get(source, 0)
         return runs
 
-    def _with_weights(self, change: GraphUpdate, before: _Decided) -> GraphUpdate:
+    def _with_weights(self, change: GraphUpdate) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
-        weights, loosened = self.states.weights(before.state), before.loosened
+        assert self._before is not None
+        size, numbers, state, _, loosened, _ = self._before
+        weights = self.states.weights(size, numbers, state)
         for edge in () if loosened is self.loosened else {*loosened, *self.loosened}:
             if loosened.get(edge) != self.loosened.get(edge):
                 weights[edge] = self.loosened.get(edge, 1.0)
         return change._replace(weigh={**change.weigh, **weights})
 
-    def _begin(self) -> _Decided:
+    def _begin(self) -> None:
+        none = np.empty(0, dtype=np.int64)
         self._before = _Decided(
-            self.states.run.copy(), self.states.state.copy(), self.loosened, self._slips)
-        self._new_ids = self._new_ids[:0]
-        return self._before
+            len(self.states), none, none, none, self.loosened, self._slips)
+        self._new_ids = none
+
+    def _decide_on(self, numbers: IntArray) -> None:
+        """Note what is decided on records, which may change now."""
+        assert self._before is not None
+        old = np.sort(numbers[numbers < self._before.size])
+        self._before = self._before._replace(
+            numbers=old, state=self.states.state[old], run=self.states.run[old])
 
     def commit(self) -> None:
         if self._before is None:
             return
-        states = self.states
-        for held, weight in states.weights(self._before.state, base=True).items():
+        states, (size, numbers, state, *_) = self.states, self._before
+        for held, weight in states.weights(size, numbers, state, base=True).items():
             self._reweighting.set_base_weight(held, weight)
-        before = np.append(self._before.state, np.full(len(states) - len(self._before.state), NEW))
-        for number in np.flatnonzero(states.state != before).tolist():
-            states.announce(number, int(before[number]), self._now_ns)
+        for number, before in zip(numbers.tolist(), state.tolist(), strict=True):
+            states.announce(number, before, self._now_ns)
+        for number in range(size, len(states)):
+            states.announce(number, NEW, self._now_ns)
         self._before, self._is_new = None, False
 
     def rollback(self) -> None:
         if self._before is None:
             return
-        run, state, self.loosened, self._slips = self._before
-        self.states.truncate(len(run))
-        self.states.run[:], self.states.state[:] = run, state
+        size, numbers, state, run, self.loosened, self._slips = self._before
+        self.states.truncate(size)
+        self.states.run[numbers], self.states.state[numbers] = run, state
         for bank in self._banks():
             bank.remove(self._new_ids)
         self._before = None
@@ -316,11 +328,11 @@ class FixJudge:
             return
         while self.step():
             pass
-        before = self._begin()
+        self._begin()
         self._slips, self.loosened = {}, {}
         self.bank.decide()
         self._apply(self.bank.told(0))
-        change = self._with_weights(GraphUpdate(), before)
+        change = self._with_weights(GraphUpdate())
         if len(change.weigh) > 0 and self._smoother.update(change).reason != '':
             self.rollback()
         else:
@@ -342,11 +354,14 @@ class FixJudge:
         states = self.states
         believed = decision is Decision.IN or (
             decision is Decision.AUTO and int(states.run[number]) == 0)
-        before, decided = self._begin(), int(states.decision[number])
+        numbers, decided = np.array((number,)), int(states.decision[number])
         states.decision[number] = AUTO
-        states.believe(np.array((number,)), np.array((believed,)))
-        if len(states.changed(before.state)) > 0 and self._smoother.update(
-                self._with_weights(GraphUpdate(), before)).reason != '':
+        self._begin()
+        self._decide_on(numbers)
+        before = int(states.state[number])
+        states.believe(numbers, np.array((believed,)))
+        if states.state[number] != before and self._smoother.update(
+                self._with_weights(GraphUpdate())).reason != '':
             self.rollback()
             states.decision[number] = decided
             return False

@@ -90,7 +90,7 @@ class OdometryChain:
             self._poses.append(np.zeros((1, 3)))
             self._sums.append(np.zeros((1, 6)))
             self._travel.append(np.zeros(1))
-        begin = int(np.searchsorted(graph.factor_ids, self._next_edge))
+        begin = graph.first_factor_from(self._next_edge)
         self._next_edge = graph.next_ids.factor
         factors = graph.factor_records[begin:]
         last = len(self) - 1

@@ -48,7 +48,7 @@ class Drive:
         sums = np.cumsum(
             adjoint @ errors.covariances(self.noises) @ np.swapaxes(adjoint, 1, 2), axis=0)
         return Odometry(np.arange(n + 1), poses, np.vstack((np.zeros(6), upper(sums))).copy(),
-                        SECOND * np.arange(n + 1), errors)
+                        np.arange(n + 1), SECOND * np.arange(n + 1), errors)
 
     def rows(self) -> npt.NDArray[np.void]:
         n = len(self.fixes)

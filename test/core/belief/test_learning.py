@@ -79,7 +79,7 @@ def a_drive(
     sums = np.cumsum(adjoint @ cov @ np.swapaxes(adjoint, 1, 2), axis=0)
     bank = Bank()
     bank.insert(rows, Odometry(np.arange(n), seen, np.vstack((np.zeros(6), upper(sums))).copy(),
-                               stamps_ns, AS_CLAIMED))
+                               np.arange(n), stamps_ns, AS_CLAIMED))
     return bank
 
 
@@ -210,7 +210,8 @@ def test_evidence_is_that_of_all_measurements_with_their_full_covariance() -> No
     sums = np.arange(n)[:, None] * (0.04, 0.0, 0.0, 0.04, 0.0, 1e-18)
     bank = Bank(noise_at((np.log2(way), 0.0, np.log2(white), np.log2(slow), np.log2(tau))))
     bank.begin_with(0, np.zeros(3), np.diag((4.0, 4.0, 1e-12)))
-    bank.insert(rows, Odometry(np.arange(n), poses, sums, stamps_ns, AS_CLAIMED))
+    bank.insert(rows, Odometry(
+        np.arange(n), poses, sums, np.arange(n), stamps_ns, AS_CLAIMED))
     learning = bank.again(bank.noise, learns=True)
     learning.decide()
     steps = np.minimum.outer(np.arange(n), np.arange(n))
