@@ -23,6 +23,7 @@ MOST, N_SOURCES = BANK.hypotheses, BANK.sources
 
 # In a fault a source is as noisy as it is else, or at least as noisy as it claims.
 QUIET, NOISY = 1, 2
+N_MODES = 3
 
 HYPOTHESIS = np.dtype([
     ('weight', 'f8'),
@@ -225,34 +226,34 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
+def _joins(bank, n, n_sources, modes, spreads):  # type: ignore[no-untyped-def]
     """
     Tell whether hypothesis n joins one before it, and which, or -1: it stays, or -2: it goes.
 
-    It goes if enough are in its place with the same faults already.
+    It goes if enough are in its place with the same faults already. Its faults as one number and
+    its spread are noted for later ones.
     """
     one, n_alike = bank[n], 0
     x, p = one.state, one.covariance
+    modes[n], spreads[n] = one.slips, p[0, 0] + p[1, 1]
+    for r in range(n_sources):
+        modes[n] = N_MODES * modes[n] + one.in_fault[r]
     for m in range(n):
-        other = bank[m]
-        same = one.slips == other.slips
-        for r in range(n_sources):
-            same = same and one.in_fault[r] == other.in_fault[r]
-        if not same:
+        if modes[m] != modes[n]:
             continue
-        y, q = other.state, other.covariance
-        one_spread, other_spread = p[0, 0] + p[1, 1], q[0, 0] + q[1, 1]
-        spread = min(one_spread, other_spread)
-        far2 = (x[0] - y[0])**2 + (x[1] - y[1])**2
         # what is known exactly and what is hardly known are not in the same place
-        if not (far2 < SAME_PLACE2 * spread
-                and max(one_spread, other_spread) < ALIKE_SPREAD * spread):
+        spread, most = min(spreads[m], spreads[n]), max(spreads[m], spreads[n])
+        if not most < ALIKE_SPREAD * spread:
+            continue
+        other = bank[m]
+        y, q = other.state, other.covariance
+        far2 = (x[0] - y[0])**2 + (x[1] - y[1])**2
+        if not far2 < SAME_PLACE2 * spread:
             continue
         turn = abs(factors.wrap(x[2] - y[2])) / math.sqrt(min(p[2, 2], q[2, 2]))
         if not turn < SAME_HEADING:
             continue
-        equal = (far2 < EQUAL2 * spread and turn < EQUAL
-                 and max(one_spread, other_spread) < 2.0 * spread)
+        equal = far2 < EQUAL2 * spread and turn < EQUAL and most < 2.0 * spread
         for r in range(n_sources):
             i = ft.ERROR + 2 * r
             if one.in_fault[r] != 0:
@@ -280,6 +281,7 @@ def advance(  # type: ignore[no-untyped-def]
     noise = noises[0]
     before, branches = np.empty_like(bank), np.empty((MOST, N_CHOICES), tree.dtype)
     weights = np.empty((MOST, N_CHOICES))
+    modes, spreads = np.empty(MOST, np.int64), np.empty(MOST)
     for at in range(first, end):
         row = table[at]
         if n == 0 or row.turn[5] * noise.turn > ft.LOST:
@@ -313,7 +315,7 @@ def advance(  # type: ignore[no-untyped-def]
             bank[n] = before[branch.before]
             bank[n].weight = weight
             _follow(bank[n], row, branch, noise, n_sources)
-            other = _joins(bank, n, n_sources)
+            other = _joins(bank, n, n_sources, modes, spreads)
             if other >= 0:
                 bank[other].weight += math.log1p(math.exp(weight - bank[other].weight))
             if other == -1:

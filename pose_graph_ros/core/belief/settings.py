@@ -58,20 +58,20 @@ class BankSettings:
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
     # at which numbers of measurements noise is learnt: the first, and the ratio of the next one
     first_learnt: int = 10
-    next_learnt: float = 1.5
+    next_learnt: float = 1.3
     # newest ones that it is learnt from while measurements come, when a quarter of them is new
     most_learnt: int = 2000
 
     # --- the bank
-    hypotheses: int = 96  # at least 5 for each heading that is tried
+    hypotheses: int = 144  # at least 5 for each heading that is tried
     sources: int = 4  # sources with an error of their own; further ones share that of the last
     # a hypothesis is dropped that is less likely by so many nats, and while measurements come
     # nothing is learnt from what such noise takes for wrong
     hopeless: float = 30.0
-    alike: int = 4  # most hypotheses with the same faults in the same place
-    same_place: float = 2.0  # that is within so many sigmas,
+    alike: int = 6  # most hypotheses with the same faults in the same place
+    same_place: float = 3.0  # that is within so many sigmas,
     alike_spread: float = 10.0  # with variances within such a factor
-    equal: float = 0.3  # within so many sigmas two become one
+    equal: float = 0.4  # within so many sigmas two become one
     period_ns: int = 1_000_000_000  # of each source one measurement in such a time decides [ns]
     # rows from one state that is kept to the next; between old ones, such a part of their age
     checkpoint: int = 16
