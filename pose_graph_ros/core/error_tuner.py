@@ -55,10 +55,8 @@ class _Change:
 class ErrorTuner:
     """Learns how noisy odometry and sources are, and has the graph treat them so."""
 
-    def __init__(
-        self, smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
-        reweighting: Reweighting, judge: Judge,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
+                 reweighting: Reweighting, judge: Judge) -> None:
         self._smoother, self._factors, self._reweighting = smoother, factors, reweighting
         self._nodes, self._judge = nodes, judge
         self._search: learning.Search | None = None
@@ -117,9 +115,8 @@ class ErrorTuner:
                 and self._wanted() is None and fixes.next_bank is None
                 and fixes.n_seen < self._next)
 
-    def _use(
-        self, found: learning.Found, learnt: learning.Learnt, newest: int | None = None,
-    ) -> None:
+    def _use(self, found: learning.Found, learnt: learning.Learnt,
+             newest: int | None = None) -> None:
         """
         Use noise that was learnt, also for judging the newest measurements, or all.
 

@@ -56,10 +56,8 @@ def _extension() -> Any:
     return importlib.import_module(NAME)
 
 
-def _factors(
-    values: npt.NDArray[Any], rows: npt.NDArray[np.int32], starts: npt.NDArray[np.int32], *,
-    ordered: bool,
-) -> Any:
+def _factors(values: npt.NDArray[Any], rows: npt.NDArray[np.int32], starts: npt.NDArray[np.int32],
+             *, ordered: bool) -> Any:
     """
     Return SuperLU's factors of a sparse symmetric or Hermitian matrix in compressed columns.
 

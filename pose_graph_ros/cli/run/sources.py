@@ -152,8 +152,7 @@ def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
                       f'for less than it could; {advice} would be right')
 
 
-def springs(run: Run, analyses: dict[str, SourceAnalysis],
-            frame: Frame) -> list[dict[str, Any]]:
+def springs(run: Run, analyses: dict[str, SourceAnalysis], frame: Frame) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
     names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []

@@ -67,9 +67,8 @@ def optimize(graph: Graph, reweighting: Reweighting, config: SolverConfig) -> Ba
     return result
 
 
-def _optimize_robustly(
-    graph: Graph, reweighting: Reweighting, config: SolverConfig,
-) -> BatchResult:
+def _optimize_robustly(graph: Graph, reweighting: Reweighting,
+                       config: SolverConfig) -> BatchResult:
     """
     Reweight from two starts and keep the result with the lower robust cost.
 
@@ -96,9 +95,8 @@ def _optimize_robustly(
     return best
 
 
-def _reweighted(
-    graph: Graph, reweighting: Reweighting, result: BatchResult, config: SolverConfig,
-) -> BatchResult:
+def _reweighted(graph: Graph, reweighting: Reweighting, result: BatchResult,
+                config: SolverConfig) -> BatchResult:
     """
     Reweight and solve until the weights converge; chi2 of the result is the robust cost.
 
@@ -131,9 +129,8 @@ def _reweighted(
     return replace(result, iterations=iterations, chi2=result.chi2 + reweighting.cost(graph))
 
 
-def _solved_with(
-    graph: Graph, weights: Mapping[int, float], config: SolverConfig,
-) -> BatchResult | None:
+def _solved_with(graph: Graph, weights: Mapping[int, float],
+                 config: SolverConfig) -> BatchResult | None:
     """
     Return the result of solving with other weights.
 

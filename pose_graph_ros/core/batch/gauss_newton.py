@@ -171,9 +171,8 @@ class CompiledSystem:
         return length, float(np.sum(self._right * self._rows['delta']))
 
 
-def solve_chordal(
-    memory: tb.Memory, known: ComplexArray, headings: ComplexArray | None,
-) -> ComplexArray:
+def solve_chordal(memory: tb.Memory, known: ComplexArray,
+                  headings: ComplexArray | None) -> ComplexArray:
     """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
     rows = memory['nodes'][:memory.head[tb.N_NODES]]
     fixed = rows['fixed'] != 0

@@ -76,10 +76,8 @@ class Terms(NamedTuple):
     kappa: FloatArray  # information on the heading
 
     @classmethod
-    def of(
-        cls, i: IntArray, j: IntArray, mean: FloatArray, offset: FloatArray | float,
-        information: FloatArray,
-    ) -> 'Terms':
+    def of(cls, i: IntArray, j: IntArray, mean: FloatArray, offset: FloatArray | float,
+           information: FloatArray) -> 'Terms':
         """Return the terms for measured poses of points of j in i or in the map."""
         offset = np.broadcast_to(offset, mean.shape)
         return cls(i, j, np.exp(1j * (mean[:, 2] - offset[:, 2])), complex_of(mean),
@@ -109,9 +107,8 @@ class NodeSystem:
     free nodes in an order of elimination with little fill; without them one is found.
     """
 
-    def __init__(
-        self, i: IntArray, j: IntArray, free: BoolArray, places: IntArray | None = None,
-    ) -> None:
+    def __init__(self, i: IntArray, j: IntArray, free: BoolArray,
+                 places: IntArray | None = None) -> None:
         self.free = np.flatnonzero(free)
         self._ends, self._n = (i, j), len(free) + 1
         number = np.full(self._n, -1)
@@ -151,9 +148,8 @@ class NodeSystem:
                                      axis=1).view(values.dtype).reshape(-1, *values.shape[1:])
         return np.asarray(total[self.free])
 
-    def solver(
-        self, by: Ends, right: ComplexArray, known: ComplexArray, own: Blocks | None = None,
-    ) -> Callable[..., ComplexArray]:
+    def solver(self, by: Ends, right: ComplexArray, known: ComplexArray,
+               own: Blocks | None = None) -> Callable[..., ComplexArray]:
         """
         Return what finds v at the minimum of the sum of |by_i v_i + by_j v_j - right|^2.
 

@@ -39,9 +39,8 @@ __all__ = [
     'plant', 'to_the_end']
 
 
-def optimize(
-    graph: Graph, config: SolverConfig, starts: Sequence[Start] = (Start.PRESENT,),
-) -> BatchResult:
+def optimize(graph: Graph, config: SolverConfig,
+             starts: Sequence[Start] = (Start.PRESENT,)) -> BatchResult:
     """
     Return the result of moving the hidden nodes to a local minimum of chi2.
 
@@ -60,9 +59,8 @@ def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResul
     return optimize(graph, config, tuple(Start))
 
 
-def in_parts(
-    graph: Graph, config: SolverConfig, starts: Sequence[Start] = (Start.PRESENT,),
-) -> Optimization:
+def in_parts(graph: Graph, config: SolverConfig,
+             starts: Sequence[Start] = (Start.PRESENT,)) -> Optimization:
     """Return the result of `optimize`, after a pause at each iteration."""
     chi2 = chi2_of(graph)
     if not np.isfinite(chi2):
@@ -102,9 +100,8 @@ def in_parts(
     return result
 
 
-def _from_starts(
-    graph: Graph, config: SolverConfig, starts: Sequence[Start], chi2: float,
-) -> Optimization:
+def _from_starts(graph: Graph, config: SolverConfig, starts: Sequence[Start],
+                 chi2: float) -> Optimization:
     """Optimise from several starts, given chi2 of the present poses."""
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
     poses = best_poses = graph.poses.copy()

@@ -126,9 +126,8 @@ class TruncatedProblem:
         self.start = start
         self._choices.clear()
 
-    def solve(
-        self, weights: FloatArray, config: SolverConfig = ROUGH, *, go_on: bool = False,
-    ) -> Solution:
+    def solve(self, weights: FloatArray, config: SolverConfig = ROUGH, *,
+              go_on: bool = False) -> Solution:
         """Move the graph from the start to the minimum for some weights."""
         self._weigh(weights)
         if not go_on:

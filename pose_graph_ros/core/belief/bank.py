@@ -283,9 +283,8 @@ class Bank:
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 
-def added_covariance(
-    likely: FloatArray, off: FloatArray, wider: FloatArray | None = None,
-) -> FloatArray:
+def added_covariance(likely: FloatArray, off: FloatArray,
+                     wider: FloatArray | None = None) -> FloatArray:
     """
     Return what other poses add to the covariance of one, shape (3, 3), in [m, m, rad].
 

@@ -42,6 +42,7 @@ ODOMETRY_BEGINS = (-4.0, -4.0), (0.0, 4.0), (4.0, 0.0), (4.0, 4.0)
 SLOW_BEGINS = (-2.0, -3.0), (0.0, -3.0), (2.0, -3.0), (-1.0, -1.0), (1.0, -1.0)
 SLOW_TAUS = 10.0, 60.0
 UNLEARNT = -1.0, -1.0, math.log2(40.0)
+LARGER = 1.0, 2.5  # by which slow errors are tried that are larger than the best ones
 MOST_ROUNDS = 2  # of learning from what is believed
 # Positions are not correlated with headings: how they are is of a place that the robot leaves.
 APART = np.array(((1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
@@ -108,7 +109,10 @@ class Found(NamedTuple):
     def spread(self, used: Learnt) -> FloatArray:
         """Return what noise other than that in use adds to the covariance of the pose, (3, 3)."""
         every = [*self.every.values()]
-        likely = np.exp([each.evidence - self.best.evidence for each in every])
+        # the evidence that slow errors need is for what is done, not for what may be
+        evidence = np.array([each.evidence + BANK.slow_evidence * sum(
+            slow > NO_SLOW for slow in each.point[axes_of(0)[1]::3]) for each in every])
+        likely = np.exp(evidence - np.max(evidence))
         return APART * added_covariance(
             likely / np.sum(likely), np.array([each.pose for each in every]) - used.pose,
             np.array([each.covariance for each in every]) - used.covariance)
@@ -151,11 +155,9 @@ class Minimum(NamedTuple):
 class Posterior:
     """The negative logarithm of the posterior density of noise, at most once at each point."""
 
-    def __init__(
-        self, rows: Records, slips: FloatArray, known: Known, *,
-        spread: tuple[float, float] = BANK.spread, least_white: float = BANK.least_white,
-        finest: float = FINEST,
-    ) -> None:
+    def __init__(self, rows: Records, slips: FloatArray, known: Known, *,
+                 spread: tuple[float, float] = BANK.spread, least_white: float = BANK.least_white,
+                 finest: float = FINEST) -> None:
         """Take slips as `log_density` does."""
         self.least = dict.fromkeys(
             (axes_of(source)[0] for source in known.sources), math.log2(least_white))
@@ -165,9 +167,8 @@ class Posterior:
         self._values: dict[Point, float] = {}  # with constant errors of odometry
         self._left = ROWS_IN_STEP
 
-    def _density(
-        self, point: Point, heading: float, has_rate: bool = True, has_scale: bool = True,
-    ) -> tuple[float, FloatArray]:
+    def _density(self, point: Point, heading: float, has_rate: bool = True,
+                 has_scale: bool = True) -> tuple[float, FloatArray]:
         constants = np.array((0.0, 0.0, (BANK.rate * has_rate)**2, (BANK.scale * has_scale)**2))
         n_sources = (len(point) - 2) // 3
         return float(log_density(self.rows, self.slips, n_sources, noise_at(point), heading,
@@ -215,9 +216,8 @@ class Posterior:
             yield
 
 
-def descend(
-    posterior: Posterior, begins: Sequence[Point], axes: Collection[int],
-) -> Generator[None, None, Minimum]:
+def descend(posterior: Posterior, begins: Sequence[Point],
+            axes: Collection[int]) -> Generator[None, None, Minimum]:
     """Return the minimum along some axes near the best of some points, by halved steps."""
     values: list[Minimum] = []
     for point in begins:
@@ -270,9 +270,33 @@ def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
     return every if every[-1] is best else [*every, best]
 
 
-def search(
-    bank: Bank, known: Known, *, begins: Collection[Point] = (), newest: int | None = None,
-) -> Search:
+def unless_given(posterior: Posterior, point: Point,
+                 axes: Collection[int]) -> Generator[None, None, Point]:
+    """Return a point, or that with odometry as given if that is nearly as likely, by some axes."""
+    known = posterior.known
+    if not known.odometry:
+        return point
+    given = yield from descend(posterior, [(*known.point[:2], *point[2:])], axes)
+    gained = (yield from posterior.shown(given.point))[0] - (
+        yield from posterior.shown(point))[0]
+    return point if gained >= BANK.noise_evidence else given.point
+
+
+def with_larger_errors(posterior: Posterior, best: Point) -> Generator[None, None, list[Point]]:
+    """Return the best points by which slow errors are larger than by the best one of all."""
+    points = list[Point]()
+    for source in posterior.known.sources:
+        white, slow, tau = axes_of(source)
+        for more in LARGER if best[slow] > NO_SLOW else ():
+            larger = yield from descend(
+                posterior, [moved(best, {slow: min(best[slow] + more, MOST)})],
+                (*((WAY, TURN) if posterior.known.odometry else ()), white, tau))
+            points.append((yield from unless_given(posterior, larger.point, (white, tau))))
+    return points
+
+
+def search(bank: Bank, known: Known, *, begins: Collection[Point] = (),
+           newest: int | None = None) -> Search:
     """
     Return the noise that explains the measurements of a bank best, or the newest ones.
 
@@ -290,17 +314,9 @@ def search(
         if (key := slips.tobytes()) not in learnt:
             every, learnt[key] = posterior(slips), []
             for best in (yield from most_likely(every)):
-                better = best
-                if known.odometry:
-                    # the best one by which odometry is as noisy as it is given
-                    given = yield from descend(
-                        every, [(*known.point[:2], *best.point[2:])],
-                        [axis for source in known.sources for axis in axes_of(source)
-                         if best.point[axis] > NO_SLOW])
-                    gained = (yield from every.shown(given.point))[0] - (
-                        yield from every.shown(best.point))[0]
-                    better = best if gained >= BANK.noise_evidence else given
-                learnt[key].append(better.point)
+                learnt[key].append((yield from unless_given(every, best.point, [
+                    axis for source in known.sources for axis in axes_of(source)
+                    if best.point[axis] > NO_SLOW])))
         return learnt[key]
 
     unlearnt = moved(known.point, {
@@ -310,9 +326,9 @@ def search(
     waiting = [(point, 0) for point in dict.fromkeys((
         *as_all, known.point, unlearnt,
         *((*point, *known.point[len(point):]) for point in begins)))]
-    for point, n_rounds in waiting:
-        if point in found:
-            continue
+    slips_by = dict[Point, FloatArray]()
+
+    def try_noise(point: Point) -> Generator[None, None, None]:
         trial = same.again(noise_at(point), len(rows))
         while trial.advance(BANK_ROWS_IN_STEP):
             yield
@@ -323,8 +339,19 @@ def search(
         slips[~is_believed(told.choice)] = -1.0
         found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
             yield from posterior(slips).shown(point))[1], *trial.newest())
+        slips_by[point] = slips
+
+    for point, n_rounds in waiting:
+        if point in found:
+            continue
+        yield from try_noise(point)
         # while measurements come there is no time for what is unlikely to lead to the best
         if n_rounds < MOST_ROUNDS and (newest is None or found[point].evidence > max(
                 each.evidence for each in found.values()) - BANK.hopeless):
-            waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
+            waiting += [(other, n_rounds + 1) for other in (yield from learn(slips_by[point]))]
+    # few slow errors were seen: larger ones may be as likely, and by them the pose is less sure
+    best = max(found.values(), key=lambda each: each.evidence)
+    for point in (yield from with_larger_errors(posterior(slips_by[best.point]), best.point)):
+        if point not in found:
+            yield from try_noise(point)
     return Found(max(found.values(), key=lambda each: each.evidence), found)

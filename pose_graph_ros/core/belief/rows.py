@@ -50,10 +50,8 @@ Records = npt.NDArray[Any]
 TABLE = types.Array(from_dtype(MEASURED), 1, 'C')
 
 
-def measured(
-    given: Factors, stamps_ns: Sequence[int], ids: Sequence[int],
-    least_position: float = BANK.least_sigmas[0],
-) -> Records:
+def measured(given: Factors, stamps_ns: Sequence[int], ids: Sequence[int],
+             least_position: float = BANK.least_sigmas[0]) -> Records:
     """
     Return rows for factors in the map or to biases, but for sources and motions.
 

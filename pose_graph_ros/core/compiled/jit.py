@@ -50,10 +50,8 @@ _registered: dict[str, Dispatcher] = {}
 _signatures: dict[str, Signature] = {}
 
 
-def kernel(
-    function: Function | None = None, *, signature: Signature | None = None,
-    allocates: bool = False, **options: Any,
-) -> Function:
+def kernel(function: Function | None = None, *, signature: Signature | None = None,
+           allocates: bool = False, **options: Any) -> Function:
     """
     Return a function that is compiled at its first call; a decorator, also as `@kernel(...)`.
 

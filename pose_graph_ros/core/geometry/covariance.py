@@ -81,9 +81,8 @@ def information(covariance: FloatArray) -> FloatArray:
     return 0.5 * (inverse + inverse.T)
 
 
-def propagated(
-    pose: FloatArray, covariance: FloatArray, increment: FloatArray, noise: FloatArray,
-) -> FloatArray:
+def propagated(pose: FloatArray, covariance: FloatArray, increment: FloatArray,
+               noise: FloatArray) -> FloatArray:
     """
     Return the covariance of `compose(pose, increment)` in map axes.
 

@@ -43,9 +43,8 @@ class TangentPlane:
 
     """
 
-    def __init__(
-        self, latitude: float, longitude: float, altitude: float = 0.0, yaw: float = 0.0,
-    ) -> None:
+    def __init__(self, latitude: float, longitude: float, altitude: float = 0.0,
+                 yaw: float = 0.0) -> None:
         if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0
                 and np.isfinite(altitude) and np.isfinite(yaw)):
             raise ValueError(
@@ -64,9 +63,8 @@ class TangentPlane:
         """The datum."""
         return MapOrigin(self.latitude, self.longitude, self.altitude, self.yaw)
 
-    def to_map(
-        self, latitude: npt.ArrayLike, longitude: npt.ArrayLike, altitude: npt.ArrayLike,
-    ) -> FloatArray:
+    def to_map(self, latitude: npt.ArrayLike, longitude: npt.ArrayLike,
+               altitude: npt.ArrayLike) -> FloatArray:
         """
         Return map coordinates of points, shape (..., 2) [m].
 

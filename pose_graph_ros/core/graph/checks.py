@@ -64,10 +64,8 @@ class Ids(NamedTuple):
 
 # --- tables of factors ----------------------------------------------------------------------
 
-def check(
-    table: Factors, kind: npt.NDArray[Any], dimension: IntArray | None = None,
-    nodes: Ids | None = None,
-) -> None:
+def check(table: Factors, kind: npt.NDArray[Any], dimension: IntArray | None = None,
+          nodes: Ids | None = None) -> None:
     """
     Raise for invalid factors, with the row, what was expected and the value.
 
@@ -168,9 +166,8 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
 _BIASES = np.full(64, NodeKind.BIAS, np.uint8)
 
 
-def other_nodes(
-    biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
-) -> tuple[npt.NDArray[Any], ...]:
+def other_nodes(biases: FloatArray, dimensions: Sequence[int],
+                landmarks: FloatArray) -> tuple[npt.NDArray[Any], ...]:
     """
     Return values, shape (S + L, 3), and types of new nodes that are no poses.
 

@@ -139,11 +139,10 @@ class Factors:
     constants = _Column()
     k = _Column()       # third nodes; -1, the default, for none
 
-    def __init__(
-        self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
-        information: npt.ArrayLike = _NO_MATRICES, kind: npt.ArrayLike = (),
-        weight: npt.ArrayLike = 1.0, constants: npt.ArrayLike = 0.0, k: npt.ArrayLike = -1,
-    ) -> None:
+    def __init__(self, i: npt.ArrayLike = (), j: npt.ArrayLike = (),
+                 mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
+                 kind: npt.ArrayLike = (), weight: npt.ArrayLike = 1.0,
+                 constants: npt.ArrayLike = 0.0, k: npt.ArrayLike = -1) -> None:
         self.records = np.empty(len(np.atleast_1d(i)), RECORD)
         self.assign(i=i, j=j, mean=mean, information=information, kind=kind, weight=weight,
                     constants=constants, k=k)
@@ -162,11 +161,9 @@ class Factors:
             column[...] = array
 
     @classmethod
-    def on(
-        cls, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
-        mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
-        kind: npt.ArrayLike = (), weight: npt.ArrayLike = 1.0,
-    ) -> 'Factors':
+    def on(cls, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
+           mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
+           kind: npt.ArrayLike = (), weight: npt.ArrayLike = 1.0) -> 'Factors':
         """Return observed nodes; the offset is the identity by default."""
         node = np.asarray(node)
         table = cls(node, np.full(len(node), -1), mean, information, kind, weight)

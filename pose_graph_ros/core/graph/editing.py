@@ -311,9 +311,8 @@ def compact(memory: tb.Memory) -> Gone:
     return Gone(nodes_gone, factors_gone)
 
 
-def _moved_up(
-    memory: tb.Memory, name: str, counter: int, stays: BoolArray,
-) -> tuple[IntArray, IntArray]:
+def _moved_up(memory: tb.Memory, name: str, counter: int,
+              stays: BoolArray) -> tuple[IntArray, IntArray]:
     """Move rows that stay up; return the ids of the others, and where each row is now, or -1."""
     n, gone = len(stays), memory[f'{name}_id'][:len(stays)][~stays].astype(np.int64)
     if len(gone) > 0:

@@ -330,9 +330,8 @@ class Graph:
         if not self._updating:
             editing.compact(self.memory)
 
-    def _checked_columns(
-        self, update: GraphUpdate, others: tuple[npt.NDArray[Any], ...],
-    ) -> tuple[npt.NDArray[Any], ...]:
+    def _checked_columns(self, update: GraphUpdate,
+                         others: tuple[npt.NDArray[Any], ...]) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
         hidden = checks.checked_poses('hidden', update.hidden)
         others = (checks.checked_poses('biases', others[0]), *others[1:])

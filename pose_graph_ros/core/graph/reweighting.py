@@ -57,9 +57,8 @@ class _Tuning(NamedTuple):
 TUNING: Final = _Tuning()
 
 
-def costs_and_weights(
-    loss: Loss, energy: FloatArray, threshold: float,
-) -> tuple[FloatArray, FloatArray]:
+def costs_and_weights(loss: Loss, energy: FloatArray,
+                      threshold: float) -> tuple[FloatArray, FloatArray]:
     """Return costs [sigma^2] and weights for unweighted energies; negative ones count as 0."""
     square = threshold**2
     rho, weight = _normalized(loss, np.maximum(energy, 0.0) / square)
@@ -191,9 +190,8 @@ class Reweighting:
         """Return the new weights of all factors whose weight changes."""
         return self._changes(graph, np.arange(len(self)), widened=widened)
 
-    def _changes(
-        self, graph: Graph, index: IntArray, *, least: float = 0.0, widened: float = 1.0,
-    ) -> Mapping[int, float]:
+    def _changes(self, graph: Graph, index: IntArray, *, least: float = 0.0,
+                 widened: float = 1.0) -> Mapping[int, float]:
         """Return the new weights of indexed factors that change by more than `least`."""
         if len(index) == 0:
             return {}

@@ -47,9 +47,8 @@ class FixStates(Judgements):
         free = self.decision[which] == vd.AUTO
         self.state[which[free]] = np.where(believed[free], vd.BELIEVED, vd.DOUBTED)
 
-    def weights(
-        self, size: int, numbers: IntArray, before: IntArray, *, base: bool = False,
-    ) -> dict[int, float]:
+    def weights(self, size: int, numbers: IntArray, before: IntArray, *,
+                base: bool = False) -> dict[int, float]:
         """
         Return weights that change, or `base` weights, by the ids of factors.
 
@@ -142,9 +141,8 @@ class OdometryStates:
         for doubt in self._gaps.values():
             self.left[doubt.verdict.source] += int(np.sum(np.isin(doubt.edges, edges)))
 
-    def follow(
-        self, loosened: Mapping[int, float], graph: Graph, now_ns: int, *, announce: bool = True,
-    ) -> None:
+    def follow(self, loosened: Mapping[int, float], graph: Graph, now_ns: int, *,
+               announce: bool = True) -> None:
         """Follow which odometry is believed less because of fixes, and note what has changed."""
         if announce and loosened is self._loosened:
             return

@@ -54,10 +54,8 @@ class _Decided(NamedTuple):
 
 
 class FixJudge:
-    def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
-        factors: FactorBuilder, chain: OdometryChain,
-    ) -> None:
+    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
+                 factors: FactorBuilder, chain: OdometryChain) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._nodes, self._factors, self._chain = nodes, factors, chain
         self.states = FixStates()
@@ -369,9 +367,8 @@ class FixJudge:
         states.decision[number] = DECISIONS.index(decision)
         return True
 
-    def restore(
-        self, saved: SavedVerdicts, loosened: Mapping[int, float], spread: FloatArray, now_ns: int,
-    ) -> None:
+    def restore(self, saved: SavedVerdicts, loosened: Mapping[int, float], spread: FloatArray,
+                now_ns: int) -> None:
         self._now_ns, self._is_restored = now_ns, True
         self.bank.spread = Spread(spread[0], spread[1:])   # until it knows the records
         self.states.restore(saved)

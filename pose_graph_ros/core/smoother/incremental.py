@@ -171,9 +171,8 @@ class IncrementalSmoother:
         """Let the running or the next `refine` end early, without effect; any thread may call."""
         self._memory.head[tb.INTERRUPT] = 1
 
-    def extend(
-        self, mean: se2.PoseVector, information: FloatArray, weight: float = 1.0,
-    ) -> UpdateResult:
+    def extend(self, mean: se2.PoseVector, information: FloatArray,
+               weight: float = 1.0) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
 

@@ -60,10 +60,8 @@ class Trial:
     starts at the better of a linear start and the present poses.
     """
 
-    def __init__(
-        self, graph: Graph, copy: Graph, update: GraphUpdate, eliminate: Callable[[], bool],
-        poses: Poses | None = None,
-    ) -> None:
+    def __init__(self, graph: Graph, copy: Graph, update: GraphUpdate,
+                 eliminate: Callable[[], bool], poses: Poses | None = None) -> None:
         self._graph, self._update, self._eliminate = graph, update, eliminate
         self._start = poses
         self._before = graph.rows()
