@@ -270,28 +270,16 @@ def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
     return every if every[-1] is best else [*every, best]
 
 
-def unless_given(posterior: Posterior, point: Point,
-                 axes: Collection[int]) -> Generator[None, None, Point]:
-    """Return a point, or that with odometry as given if that is nearly as likely, by some axes."""
-    known = posterior.known
-    if not known.odometry:
-        return point
-    given = yield from descend(posterior, [(*known.point[:2], *point[2:])], axes)
-    gained = (yield from posterior.shown(given.point))[0] - (
-        yield from posterior.shown(point))[0]
-    return point if gained >= BANK.noise_evidence else given.point
-
-
 def with_larger_errors(posterior: Posterior, best: Point) -> Generator[None, None, list[Point]]:
     """Return the best points by which slow errors are larger than by the best one of all."""
-    points = list[Point]()
-    for source in posterior.known.sources:
+    known, points = posterior.known, list[Point]()
+    for source in known.sources:
         white, slow, tau = axes_of(source)
         for more in LARGER if best[slow] > NO_SLOW else ():
             larger = yield from descend(
                 posterior, [moved(best, {slow: min(best[slow] + more, MOST)})],
-                (*((WAY, TURN) if posterior.known.odometry else ()), white, tau))
-            points.append((yield from unless_given(posterior, larger.point, (white, tau))))
+                (*((WAY, TURN) if known.odometry else ()), white, tau))
+            points.append(larger.point)
     return points
 
 
@@ -314,9 +302,17 @@ def search(bank: Bank, known: Known, *, begins: Collection[Point] = (),
         if (key := slips.tobytes()) not in learnt:
             every, learnt[key] = posterior(slips), []
             for best in (yield from most_likely(every)):
-                learnt[key].append((yield from unless_given(every, best.point, [
-                    axis for source in known.sources for axis in axes_of(source)
-                    if best.point[axis] > NO_SLOW])))
+                better = best
+                if known.odometry:
+                    # the best one by which odometry is as noisy as it is given
+                    given = yield from descend(
+                        every, [(*known.point[:2], *best.point[2:])],
+                        [axis for source in known.sources for axis in axes_of(source)
+                         if best.point[axis] > NO_SLOW])
+                    gained = (yield from every.shown(given.point))[0] - (
+                        yield from every.shown(best.point))[0]
+                    better = best if gained >= BANK.noise_evidence else given
+                learnt[key].append(better.point)
         return learnt[key]
 
     unlearnt = moved(known.point, {
@@ -349,9 +345,9 @@ def search(bank: Bank, known: Known, *, begins: Collection[Point] = (),
         if n_rounds < MOST_ROUNDS and (newest is None or found[point].evidence > max(
                 each.evidence for each in found.values()) - BANK.hopeless):
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips_by[point]))]
-    # few slow errors were seen: larger ones may be as likely, and by them the pose is less sure
     best = max(found.values(), key=lambda each: each.evidence)
+    # few slow errors were seen: larger ones may be as likely, and by them the pose is less sure
     for point in (yield from with_larger_errors(posterior(slips_by[best.point]), best.point)):
         if point not in found:
             yield from try_noise(point)
-    return Found(max(found.values(), key=lambda each: each.evidence), found)
+    return Found(best, found)
