@@ -9,6 +9,7 @@ import functools
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
+from saved_graphs import Event, feed
 
 from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -35,17 +36,6 @@ LONGEST_DELAY = 60.0
 WINDOW = 0.25
 DURATION = 40.0
 T_MAP_ODOM = np.array([40.0, -25.0, 2.1])
-
-
-@dataclass(frozen=True)
-class Event:
-    """What comes from a source."""
-
-    source: str
-    what: OdometrySample | Measurement
-
-    def __lt__(self, other: 'Event') -> bool:
-        return (self.what.stamp_ns, self.source) < (other.what.stamp_ns, other.source)
 
 
 def stamp_of(time: float) -> int:
@@ -145,12 +135,6 @@ DRIVES = {(number, robust): simulated(number, outliers=robust)
 
 def drive(number: int, kind: str) -> tuple[list[Event], list[Event]]:
     return DRIVES[number, kind == 'robust']
-
-
-def feed(backend: PoseGraphBackend, event: Event) -> str:
-    if isinstance(event.what, OdometrySample):
-        return backend.add_odometry(event.what, event.source).reason
-    return backend.add_measurement(event.what, event.source).reason
 
 
 @dataclass(frozen=True)

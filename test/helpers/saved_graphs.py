@@ -1,23 +1,39 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Drives whose graphs are saved, and the comparison of saved graphs."""
+"""Drives whose graphs are saved, what comes in them, and the comparison of saved graphs."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
-from test_delay_invariance import Event, feed
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, OdometrySource
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.measurements import Measurement, OdometrySample
 
 SECOND = 1_000_000_000
 
 LINE_ODOMETRY = BackendConfig(odometry={'odom': OdometrySource()})
+
+
+@dataclass(frozen=True)
+class Event:
+    """What comes from a source."""
+
+    source: str
+    what: OdometrySample | Measurement
+
+    def __lt__(self, other: 'Event') -> bool:
+        return (self.what.stamp_ns, self.source) < (other.what.stamp_ns, other.source)
+
+
+def feed(backend: PoseGraphBackend, event: Event) -> str:
+    if isinstance(event.what, OdometrySample):
+        return backend.add_odometry(event.what, event.source).reason
+    return backend.add_measurement(event.what, event.source).reason
 
 
 def feed_all(backend: PoseGraphBackend, events: Iterable[Event]) -> None:

@@ -262,3 +262,15 @@ def test_of_a_good_start_the_newest_pose_is_known_soon() -> None:
     bank = Drive(0).bank()
     bank.decide()
     assert np.trace(bank.spread.covariance[:2, :2]) < 0.1
+
+
+def test_the_newest_measurements_are_filtered_again_from_about_there_at_any_length() -> None:
+    """Else learning from the newest ones would take longer and longer."""
+    bank = Drive(6, 1500).bank()
+    bank.decide()
+    for newest in (150, 600, 1200):
+        again = bank.again(as_claimed(), newest)
+        n_again = len(again) - again.done
+        assert newest <= n_again <= 1.25 * newest
+        again.decide()
+        assert again.told(0).choice[-100:].tolist() == bank.told(0).choice[-100:].tolist()

@@ -263,3 +263,16 @@ def test_the_spread_by_noise_is_added_to_that_by_hypotheses_and_outlives_the_noi
     again.decide()
     np.testing.assert_allclose(again.spread.pose, before.pose)
     np.testing.assert_allclose(again.spread.covariance - before.covariance, bank.by_noise)
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_larger_slow_errors_are_tried_and_make_the_newest_pose_less_sure(seed: int) -> None:
+    bank = a_drive(seed, n=400, period=0.25, tau=30.0, sigma=2.0, white=0.02)
+    found = to_the_end(search(bank, ALL))
+    best = found.best
+    assert best.point[3] > NO_SLOW
+    larger = [each for each in found.every.values() if each.point[3] >= best.point[3] + 1.0]
+    assert max(each.evidence for each in larger) > best.evidence - 10.0
+    alone = Found(best, {point: each for point, each in found.every.items()
+                         if each not in larger})
+    assert np.trace(found.spread(best)) > np.trace(alone.spread(best))

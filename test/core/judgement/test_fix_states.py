@@ -39,3 +39,16 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
     for each in (states, again):
         each.append(Queued('fix', UNSEEN, 0, number=0), 0, BELIEVED)
     assert again.name(len(again) - 1) == states.name(len(states) - 1)
+
+
+@settings(deadline=None, max_examples=50)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_records_are_found_by_the_ids_that_they_were_added_as(seed: int) -> None:
+    rng, states = np.random.default_rng(seed), FixStates()
+    ids = np.unique(rng.integers(0, 400, rng.integers(0, 200)))
+    for number in ids.tolist():
+        states.append(Queued('fix', UNSEEN, number, number=number), 0, BELIEVED)
+    of = {number: k for k, number in enumerate(ids.tolist())}
+    # mostly new ones, as after an update, and some that are old or not there
+    wanted = rng.integers(rng.integers(0, 400), 401, rng.integers(0, 30))
+    assert states.numbers_of(wanted).tolist() == [of.get(k, -1) for k in wanted.tolist()]
