@@ -13,6 +13,7 @@ from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import TUNING
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother import incremental as inc
+from pose_graph_ros.core.transaction import checked, Transaction
 
 # Constraints with a loss that are looked at in turn without a change after an update.
 LOOKED_AT = 2 * TUNING.part
@@ -46,10 +47,11 @@ class Refiner:
             weights = self._reweighting.changes(self._smoother.graph)
             if len(weights) == 0:
                 break
-            settled, again = False, self._weigh(weights)
-            if again.status is Status.FAILED:
+            settled = False
+            with Transaction() as transaction:
+                result = checked(self._weigh(weights))
+            if transaction.failure != '':
                 break
-            result = again
         return result, settled
 
     @property

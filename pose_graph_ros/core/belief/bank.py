@@ -153,7 +153,7 @@ class Bank:
 
     def advance(self, most: int) -> bool:
         """Take the bank along at most so many rows; return whether some are left."""
-        n = min(self.done + most, len(self))
+        first, n = self.done, min(self.done + most, len(self))
         self._tree.append(np.zeros((n - self.done, BANK.hypotheses), BRANCH))
         while self.done < n:
             end = min(n, (self.done // BANK.checkpoint + 1) * BANK.checkpoint)
@@ -162,13 +162,14 @@ class Bank:
             self.done = end
             if end % BANK.checkpoint == 0:
                 self._kept[end] = self._bank[:self._n].copy()
-        last, *kept = sorted(self._kept)
-        for at, after in pairwise(kept):
-            # the older they are, the farther apart
-            if after - last < (n - at) // BANK.kept:
-                del self._kept[at]
-            else:
-                last = at
+        if n // BANK.checkpoint > first // BANK.checkpoint:
+            last, *kept = sorted(self._kept)
+            for at, after in pairwise(kept):
+                # the older they are, the farther apart
+                if after - last < (n - at) // BANK.kept:
+                    del self._kept[at]
+                else:
+                    last = at
         return n < len(self)
 
     def decide(self) -> Decided:

@@ -54,7 +54,8 @@ class FixStates(Judgements):
 
         There were so many records, and some had another state.
         """
-        changed, later = self.changed(numbers, before), np.empty(0, dtype=np.int64)
+        changed = numbers[self.state[numbers] != before]
+        later = np.empty(0, dtype=np.int64)
         doubted = np.flatnonzero(self.state[size:] != vd.BELIEVED) + size
         again = self.stamps_ns[changed[self.state[changed] == vd.BELIEVED], 0]
         if not base and len(again) > 0:
@@ -63,10 +64,6 @@ class FixStates(Judgements):
         which = np.concatenate((doubted, later, changed))
         believed = self.state[which] == vd.BELIEVED
         return dict(zip(self.held[which].tolist(), believed.astype(float).tolist(), strict=True))
-
-    def changed(self, numbers: IntArray, before: IntArray) -> IntArray:
-        """Return the numbers of those records that had another state."""
-        return numbers[self.state[numbers] != before]
 
     def numbers_of(self, factors: IntArray) -> IntArray:
         """Return the numbers of records by the ids they were added as, -1 where there is none."""

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What happens to measurements before they are in the graph: thinned, dropped, placed."""
 
-
 import numpy as np
 import pytest
 
