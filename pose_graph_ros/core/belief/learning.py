@@ -109,9 +109,11 @@ class Found(NamedTuple):
     def spread(self, used: Learnt) -> FloatArray:
         """Return what noise other than that in use adds to the covariance of the pose, (3, 3)."""
         every = [*self.every.values()]
-        # the evidence that slow errors need is for what is done, not for what may be
+        # the evidence that slow errors need is for what is done, not for what may be; but where
+        # all may be a fault, the pose would hardly be known for nothing that speaks for it
         evidence = np.array([each.evidence + BANK.slow_evidence * sum(
-            slow > NO_SLOW for slow in each.point[axes_of(0)[1]::3]) for each in every])
+            slow > NO_SLOW and each.covariance[0, 0] < BANK.fault_size**2
+            for slow in each.point[axes_of(0)[1]::3]) for each in every])
         likely = np.exp(evidence - np.max(evidence))
         return APART * added_covariance(
             likely / np.sum(likely), np.array([each.pose for each in every]) - used.pose,

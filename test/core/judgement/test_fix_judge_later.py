@@ -222,5 +222,5 @@ def test_the_covariance_is_wide_while_nobody_can_tell_which_fixes_are_wrong() ->
         error = np.hypot(*(estimate.T_map_base[:2] - event.position))
         sigmas[second] = float(np.sqrt(np.trace(estimate.covariance[:2, :2])))
         assert error < 8.0 * sigmas[second] or second <= 32
-    # nothing speaks against them yet, but that a few may have slow errors that were not seen
-    assert sigmas[29] < 3.0 < sigmas[36] < sigmas[55]
+    assert sigmas[29] < 1.0         # nothing speaks against them yet
+    assert 3.0 < sigmas[36] < sigmas[55]
