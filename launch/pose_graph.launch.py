@@ -1,9 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start the node with its parameter file, and optionally RViz.
+Start the node with its parameter file, and optionally RViz, such as on a robot.
 
-    ros2 launch pose_graph_ros pose_graph.launch.py odom:=/wheel/odometry fix:=/gnss/fix rviz:=true
+    ros2 launch pose_graph_ros pose_graph.launch.py odom:=/wheel/odom state_file:=~/.ros/map.db
 """
 
 from pathlib import Path

@@ -62,14 +62,14 @@ OFFLINE = {
 }
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',
-       'core.forgetting', 'core.parts', 'core.refiner',
+       'core.forgetting', 'core.parts', 'core.recovery', 'core.refiner',
        'core.transaction', 'core.warm_up'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
-LOGIC = ('input', 'log', 'worker')
+LOGIC = ('input', 'log', 'stored_graphs', 'worker')
 
 MOST_LINES = 450
 

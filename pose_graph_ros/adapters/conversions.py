@@ -12,7 +12,6 @@ unchanged; `core.sources.validation` applies the covariance policy of the source
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 import math
 import re
 import threading
@@ -349,7 +348,7 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> ms.Fix | Answer
     if np.all(np.isfinite(cov)):
         with np.errstate(over='ignore', invalid='ignore'):
             cov = covariance.turned(cov, by.datum.yaw)
-    return ms.Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
+    return ms.Fix(stamp, (latitude, longitude, altitude), by.datum.place, cov,
                   by.lever_arm(frame(message.header.frame_id), source))
 
 

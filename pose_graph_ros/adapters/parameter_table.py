@@ -96,6 +96,11 @@ PARAMETERS: tuple[Parameter, ...] = (
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
     Early('load_graph_on_start', False, '', 'Whether to continue with the graph in `graph_file`, '
           'once there is one. If it cannot be loaded, the node is not configured.'),
+    Early('state_file', '', '', 'File in which the node keeps all that it accepts, such as '
+          '~/.ros/pose_graph.db, and from which it continues when it is started again, also after '
+          'a power failure. If empty, there is none.'),
+    Early('state_period', 1.0, 's', 'Time within which what was accepted is in `state_file`.',
+          0.01, 60.0),
     Early('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
           'optionally, the angle from east to its x axis. If unset, the first fix is the origin '
           'and the x axis points east.', sizes=(0, 2, 3)),

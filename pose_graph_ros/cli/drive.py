@@ -289,7 +289,7 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
     # a fix that can have been used makes the datum, if there is none
     for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
         each = fixes[k]
-        positions[k] = each.place() if isinstance(each, Fix) else (
+        positions[k] = each.placed().position if isinstance(each, Fix) else (
             each.pose[:2] if isinstance(each, kinds.GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The facade of the engine, for the node, the offline tools and the tests."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Self
@@ -99,6 +100,16 @@ class PoseGraphBackend:
     def n_waiting(self) -> int:
         """Number of measurements that wait for odometry to reach their stamps, or for a beacon."""
         return len(self._pipeline.waiting) + len(self._pipeline.beacons)
+
+    @property
+    def pending(self) -> Sequence[tuple[str, ms.PoseMeasurement]]:
+        """The measurements that wait, with their sources, which a saved graph does not have."""
+        return self._pipeline.pending
+
+    def take_pending(self, pending: Iterable[tuple[str, ms.PoseMeasurement]]) -> None:
+        """Take what was `pending` in an engine whose saved graph this one continues."""
+        for source, measurement in pending:
+            self._pipeline.take(measurement, source)
 
     @property
     def n_quarantined(self) -> int:

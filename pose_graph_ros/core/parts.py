@@ -73,7 +73,7 @@ def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None)
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
     pipeline = parts.pipeline
-    left_out = [*(each[1:] for each in pipeline.waiting), *pipeline.beacons.measurements]
+    left_out = pipeline.pending
     return SavedGraph(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=parts.factors.saved(),
         seen=pipeline.seen.saved(left_out), losses=deepcopy(parts.reweighting),

@@ -8,7 +8,7 @@ annotated with the types of this module, which decoding follows. A value that do
 form of its annotation raises one of `MISMATCHES`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from types import UnionType
 from typing import Annotated, Any, get_args, get_origin, get_type_hints, NamedTuple, Union
@@ -46,18 +46,19 @@ def as_pose(numbers: FloatArray) -> Pose:
     return x, y, theta
 
 
-def encoded(value: Any) -> Any:
-    """Return a value as lists, dictionaries, strings and numbers."""
+def encoded(value: Any, array: Callable[[Any], Any] = np.ndarray.tolist) -> Any:
+    """Return a value as lists, dictionaries, strings, numbers and what `array` makes of arrays."""
     if isinstance(value, Mapping):
-        return {key: encoded(item) for key, item in value.items()}
+        return {key: encoded(item, array) for key, item in value.items()}
     # `Factors` and `GrowingArray` are their arrays
     value = getattr(value, 'records', getattr(value, 'values', value))
     if isinstance(value, np.ndarray):
-        return value.tolist() if value.dtype.names is None else {
-            name: value[name].tolist() for name in value.dtype.names}
+        return array(value) if value.dtype.names is None else {
+            name: array(value[name]) for name in value.dtype.names}
     if is_dataclass(value) or hasattr(value, '_fields'):
-        return {name: encoded(getattr(value, name)) for name in type(value).__annotations__}
-    return [encoded(each) for each in value] if isinstance(value, tuple) else value
+        return {name: encoded(getattr(value, name), array)
+                for name in type(value).__annotations__}
+    return [encoded(each, array) for each in value] if isinstance(value, tuple) else value
 
 
 def decoded(kind: Any, plain: Any) -> Any:

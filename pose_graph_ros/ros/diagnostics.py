@@ -48,6 +48,10 @@ def values(session: 'Session') -> dict[str, object]:
         'paused': int(session.input.paused), 'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * total / max(updates, 1):.3f}',
         'solve_max_ms': f'{1e3 * longest:.3f}', 'memory_mb': f'{memory() / 1e6:.0f}'}
+    if (journal := session.journal) is not None:
+        found |= {'journal.lag_max_s': f'{journal.lag:.3f}',
+                  'journal.size_mb': f'{journal.size / 1e6:.3f}',
+                  'journal.is_whole': int(not journal.has_gap)}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
     found |= {f'{source}.{answer}': count
@@ -177,6 +181,9 @@ def concerns(session: 'Session') -> Iterator[Concern]:
         yield Concern(ERROR, 'the solver failed with ' + (
             ', '.join(worker.status.set_aside) or 'the newest measurements') + ': set aside until '
             '~/optimize; the estimate is without them. See the log for the reason')
+    if session.journal is not None and session.journal.failure != '':
+        yield Concern(ERROR, f'the journal cannot be written, and what comes would be lost with '
+                      f'this process: {session.journal.failure}')
     if not session.active:
         yield Concern(GOOD, 'inactive: activate the node (ros2 lifecycle set)')
     if received.paused:

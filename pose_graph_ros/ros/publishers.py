@@ -193,6 +193,7 @@ class Publishers:
         if (is_due or at_once) and not self._holds(estimate):
             newest = backend.estimate()
             assert newest is not None
+            worker.keep_path(newest)
             path = thinned(newest.path, newest.n_frozen)
             publish(self.path, estimate, lambda at: output_cdr.path_cdr(path, at, self.map_frame))
         period = max(2.0 * self._path_period, 0.1)

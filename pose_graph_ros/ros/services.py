@@ -24,7 +24,8 @@ from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
 from pose_graph_ros.core.io.graph_files import SavedGraph, site_refusal, write_graph
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.spinning import Spinner
-from pose_graph_ros.ros.worker import graph_path, restored, Worker
+from pose_graph_ros.ros.stored_graphs import graph_path, restored
+from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
 

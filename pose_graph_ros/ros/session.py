@@ -8,7 +8,8 @@ the newest estimate, propagated by it, is published; path and markers are after 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
+from contextlib import suppress
 from functools import partial
 import logging
 import math
@@ -29,7 +30,8 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.ros import diagnostics, log, publishers, spinning, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
-from pose_graph_ros.ros.worker import continued, initial_graph, SetPoseInput, Worker
+from pose_graph_ros.ros.stored_graphs import continued, from_journal, initial_graph, journal_of
+from pose_graph_ros.ros.worker import SetPoseInput, Worker
 
 logger = logging.getLogger(__name__)
 
@@ -55,12 +57,17 @@ class Session:
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.journal = journal = journal_of(values)
 
         def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
             self._warm_up(stopped)
-            return None if path is None or stopped() else continued(path, self._config)
+            backend = None if journal is None or stopped() else from_journal(
+                journal, self._config, self.input.reader.datum)
+            return backend if backend is not None or path is None or stopped() else continued(
+                path, self._config)
 
-        self._begin(PoseGraphBackend(self._config), prepare, resumes=path is not None)
+        self._begin(PoseGraphBackend(self._config), prepare,
+                    resumes=journal is not None or path is not None)
         if datum is not None:
             self.input.reader.datum.keep(datum)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
@@ -75,7 +82,8 @@ class Session:
         self.searches = diagnostics.Searches()
         graph = self.out.graph
         self.worker = worker = Worker(
-            backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare)
+            backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare,
+            None if self.journal is None else self.journal.begin())
         worker.thread.start()
         if resumes:
             self.worker.request_update()
@@ -138,10 +146,21 @@ class Session:
         if self.active:
             self.deactivate()
         self.node.destroy_timer(self._timers.pop('diagnostics'))
+        if self.journal is not None:
+            with suppress(CancelledError, TimeoutError):
+                self._keep_state().result(STOP_TIMEOUT)
         if not self.worker.stop(STOP_TIMEOUT):
             logger.warning('stopping in the middle of %s',
                            'a compilation' if self.compiling else 'a solve')
+        if self.journal is not None and not self.journal.close(STOP_TIMEOUT):
+            logger.warning('the journal is still being written')
         self.out.close()
+
+    def _keep_state(self) -> 'Future[None]':
+        """Make the worker's thread write the state of the engine into the journal."""
+        worker, plane = self.worker, self.input.reader.datum.plane
+        return worker.call(lambda _: worker.keep_state(None if plane is None else plane.origin),
+                           'the state for the journal')
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
@@ -276,6 +295,9 @@ class Session:
         if self.input.is_streaming and 0.0 < self.values['closing_silence'] < silence:
             self.input.is_streaming = False
             self.optimize()
+        if self.worker.prepared and self.worker.chapter is not None and (
+                self.worker.chapter.is_due(silence)):
+            self._keep_state()
 
     def _on_views_timer(self) -> None:
         """Make the worker's thread publish path and markers that are due."""

@@ -13,24 +13,23 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
-from pathlib import Path
 import threading
 import time
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from pose_graph_ros.adapters.conversions import datum_of, frame, Message, pose_in
+from pose_graph_ros.adapters.conversions import frame, Message, pose_in
 from pose_graph_ros.adapters.sources import JUDGE, Measured, SET_POSE
 from pose_graph_ros.core import measurements as ms
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
-from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
+from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import covariance, geodesy, se2
-from pose_graph_ros.core.io import graph_files
-from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph
+from pose_graph_ros.core.io.journal import Chapter
+from pose_graph_ros.core.io.journal_file import KnownPath
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -80,8 +79,10 @@ class Worker:
     def __init__(
         self, backend: PoseGraphBackend, on_estimate: Callable[[PoseGraphBackend], None],
         prepare: Callable[[Callable[[], bool]], PoseGraphBackend | None] = lambda _: None,
+        chapter: Chapter | None = None,
     ) -> None:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
+        self.chapter = chapter  # of the journal, if there is one
         self.prepared = False  # whether the preparation has ended
         self.is_optimal = False  # whether the whole graph was optimised since the last update
         self._inbox: deque[tuple[str, Measured]] = deque()
@@ -112,6 +113,8 @@ class Worker:
             if len(self._inbox) >= 100_000:
                 return False
             self._inbox.append((source, measurement))
+            if self.chapter is not None:
+                self.chapter.measured(source, measurement)
             if len(self._inbox) == 1:
                 self._condition.notify()
         return True
@@ -143,6 +146,7 @@ class Worker:
         """Hand a decision to the engine, which answers in the log; an update follows at once."""
         def act(backend: PoseGraphBackend) -> None:
             name, text = str(message.key).strip(), str(message.value).strip().lower()
+            self._note('decide', name, text)
             choices = [decision.value for decision in Decision]
             answer = backend.decide(name, Decision(text)) if text in choices else ms.rejected(
                 'unknown_decision', f'expected one of {", ".join(choices)} as the value for the '
@@ -158,6 +162,7 @@ class Worker:
         def act(backend: PoseGraphBackend) -> None:
             x, y, yaw = pose.pose
             where = f'to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {map_frame}'
+            self._note('set_pose', pose, SET_POSE)
             _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
                   f'the pose is set {where}')
             self.request_update()
@@ -166,6 +171,9 @@ class Worker:
     def _run(self) -> None:
         try:
             self._backend = self._prepare(lambda: self._stopping) or self._backend
+            if not self._stopping:
+                # before anything is solved again, what was there before
+                self._publish()
         except Exception:
             # kernels are then compiled when they are first needed
             logger.exception('the preparation of the worker failed')
@@ -217,6 +225,10 @@ class Worker:
                 self._backend.refusals[key] = f'{type(error).__name__}: {error}'
                 logger.exception('a measurement of %s could not be added', source)
         self.is_optimal = self.is_optimal and not wanted
+        if self.chapter is not None:
+            self.chapter.taken += len(batch)
+        if wanted:
+            self._note('update')
         report = self._update(self._backend.update) if wanted else None
         # after a jump of the odometry the old estimate cannot be propagated
         stale = self._revision != self._backend.revision
@@ -248,11 +260,30 @@ class Worker:
 
     def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
         """Optimise the whole graph; a job for `call`."""
+        self._note('optimize')
         report = self._update(backend.optimize)
         self.is_optimal = report.status is Status.CONVERGED
         self._publish()
         self._report(report, 0)
         return report
+
+    def _note(self, act: str, *values: object) -> None:
+        """Note in the journal what the engine does now."""
+        if self.chapter is not None:
+            self.chapter.act(act, *values)
+
+    def keep_path(self, path: Estimate) -> None:
+        """Let the journal have a path that is about to be published, in this thread."""
+        if self.chapter is not None and path.alignment is not AlignmentState.UNALIGNED:
+            n = path.n_hidden   # without the newest odometry
+            self.chapter.keep_path(KnownPath(path.path.stamps_ns[:n], path.path.poses[:n]))
+
+    def keep_state(self, datum: geodesy.MapOrigin | None) -> None:
+        """Let the journal have the state of the engine, in this thread."""
+        if (chapter := self.chapter) is not None and len(self._backend.node_stamps_ns) > 0:
+            begin = time.monotonic()
+            saved = self._backend.saved(datum)
+            chapter.checkpoint(saved, self._backend.pending, time.monotonic() - begin)
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
         """Log and count an error; one of this project tells users why, and needs no traceback."""
@@ -308,7 +339,7 @@ class Worker:
         return len(changes)
 
 
-# --- what a person asks for: poses that are set, decisions on constraints, files of the graph
+# --- what a person asks for: poses that are set, and decisions on constraints
 
 # Stamps that stand for the newest odometry (if the message has no stamp), and for the first
 # odometry (if the message came before it) [ns].
@@ -357,56 +388,3 @@ def _tell(answer: ms.Answer, refused: str, done: str) -> None:
         logger.warning('%s: %s: %s', refused, answer.reason, answer.detail, extra=ANSWER)
     else:
         logger.info('%s', done)
-
-
-def graph_path(values: Mapping[str, Any]) -> Path:
-    """Return the file that graph_file names; raises `ConfigError` if it names none."""
-    if (name := values['graph_file']) == '':
-        raise ConfigError('parameter graph_file: expected the name of a file, such as '
-                          "~/map.g2o, got ''")
-    try:
-        return Path(name).expanduser().absolute()
-    except RuntimeError as error:
-        raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
-
-
-def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOrigin | None]:
-    """
-    Return file and datum of the graph that a node starts with; None before one was saved.
-
-    Only the checksums and the datum are read, as whoever configures the node waits for it.
-    """
-    if not values['load_graph_on_start']:
-        return None, None
-    path, plane = graph_path(values), datum_of(values).plane
-    try:
-        if not path.is_dir() and not any(map(Path.exists, graph_files.graph_paths(path))):
-            logger.warning('there is no graph in %s yet: starting with an empty one, which '
-                           '~/save_graph writes there', path)
-            return None, None
-        datum = graph_files.read_datum(path)
-    except (FileFormatError, OSError) as error:
-        raise ConfigError(f'parameter load_graph_on_start: {error}') from error
-    if datum is not None and plane is not None and (
-            refusal := datum_refusal(datum, plane.origin)) is not None:
-        raise ConfigError(f'parameter load_graph_on_start: {path}: {refusal}')
-    return path, datum
-
-
-def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
-    """Return an engine that continues a saved graph; None, which is logged, if that fails."""
-    try:
-        saved, backend = restored(path, config)
-    except Exception:
-        logger.exception('%s could not be loaded: a new graph is started', path)
-        return None
-    logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), path)
-    return backend
-
-
-def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
-    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
-    saved = graph_files.read_graph(path)
-    backend = PoseGraphBackend.restored(config, saved)
-    backend.update()
-    return saved, backend

@@ -114,7 +114,7 @@ class Given:
 
     def publish_views(self, newest: Estimate, graph: int, *, at_once: bool = False) -> None:
         """Publish path, markers and verdicts after an update of a graph."""
-        worker = Space(estimate=newest, status=WorkerStatus())
+        worker = Space(estimate=newest, status=WorkerStatus(), keep_path=lambda _: None)
         path = Trajectory(np.array([newest.stamp_ns]), np.zeros((1, 3)))
         self.out.publish_views(worker, graph, Space(
             estimate=lambda: Space(path=path, n_frozen=0), view=lambda: VIEW,

@@ -190,7 +190,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
                    status=session.worker.status, estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
                      arrivals={'fix': Space(wrong='')}, reader=Space(sources={}))
-    seen = Space(worker=worker, active=True, input=received,
+    seen = Space(worker=worker, active=True, journal=None, input=received,
                  is_loaded=False, compiling=False, values=session.values,
                  node=Space(count_publishers=lambda _: 0),
                  searches=Space(contradiction=None),

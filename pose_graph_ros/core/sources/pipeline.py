@@ -135,13 +135,24 @@ class MeasurementPipeline:
         if settings.minimum_period > 0.0 and self.seen.near(
                 source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
             return ms.rejected('thinned', f'less than {settings.minimum_period} s from another')
+        answer = self.take(checked, source)
+        if answer.status is not ms.AnswerStatus.REJECTED:
+            for repair in validated.repairs:
+                self.counts[source, repair] += 1
+        return answer
+
+    def take(self, checked: ms.PoseMeasurement, source: str) -> ms.Answer:
+        """Attach a measurement that is good, or let it wait."""
         answer = (self._attach(checked, source) if due_ns(checked) <= self.nodes.covered_ns
                   else self._wait(checked, source))
         if answer.status is not ms.AnswerStatus.REJECTED:
             self.seen.add(source, checked)
-            for repair in validated.repairs:
-                self.counts[source, repair] += 1
         return answer
+
+    @property
+    def pending(self) -> list[tuple[str, ms.PoseMeasurement]]:
+        """The measurements that `take` has let wait, with their sources."""
+        return [*(each[1:] for each in self.waiting), *self.beacons.measurements]
 
     def _wait(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""

@@ -1,0 +1,93 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+An engine from what a journal holds: its state at a checkpoint, and then all that came, once more.
+
+Measurements come in the same order, with updates between them as there were. The path that was
+published last is taken as it was, as solving again does not give the same bits.
+"""
+
+from dataclasses import replace
+import logging
+
+import numpy as np
+
+from pose_graph_ros.core import measurements as ms, saved_columns as sc
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.io.graph_files import SavedGraph
+from pose_graph_ros.core.io.journal_file import Entry, Found, KnownPath, measurement_of, Place
+from pose_graph_ros.core.judgement.verdicts import Decision
+
+logger = logging.getLogger(__name__)
+
+
+def recovered(config: BackendConfig, found: Found, place: Place) -> PoseGraphBackend:
+    """
+    Return an engine that continues where the journal ends.
+
+    `place` returns the position in the map of a latitude, longitude and altitude. What cannot be
+    done again is logged and left out.
+    """
+    if found.state is None:
+        backend = PoseGraphBackend(config)
+    else:
+        backend = PoseGraphBackend.restored(config, found.state.saved)
+        backend.take_pending((source, measurement_of(values, place))
+                             for source, values in found.state.pending)
+    n_failed = 0
+    for entry in found.entries:
+        try:
+            if entry.name == 'resume' and entry.act > 0:
+                backend = _again(backend, config, KnownPath())
+            else:
+                _do(backend, entry, place)
+        except Exception:
+            n_failed += 1
+            if n_failed == 1:
+                logger.exception('from the journal, %s cannot be done again', entry[:3])
+    return _again(backend, config, found.path)
+
+
+def _do(backend: PoseGraphBackend, entry: Entry, place: Place) -> None:
+    if entry.act == 0:
+        measurement = measurement_of(entry.values, place)
+        if isinstance(measurement, ms.OdometrySample):
+            backend.add_odometry(measurement, entry.name)
+        else:
+            backend.add_measurement(measurement, entry.name)
+    elif entry.name == 'decide':
+        name, decision = entry.values
+        backend.decide(name, Decision(decision))
+    elif entry.name == 'set_pose':
+        pose, source = entry.values
+        backend.set_pose(sc.decoded(ms.GlobalPose, pose), source)
+    elif entry.name == 'optimize':
+        backend.optimize()
+    else:
+        backend.update()
+
+
+def _again(backend: PoseGraphBackend, config: BackendConfig, path: KnownPath) -> PoseGraphBackend:
+    """Return an engine like one, with another path, whose odometry may have another origin."""
+    if len(backend.node_stamps_ns) == 0:
+        return backend
+    again = PoseGraphBackend.restored(config, _on(backend.saved(), path))
+    again.take_pending(backend.pending)
+    again.counts.update(backend.counts)
+    return again
+
+
+def _on(saved: SavedGraph, path: KnownPath) -> SavedGraph:
+    """Return a graph whose nodes lie on a path, as far as it has them."""
+    nodes, rows = saved.nodes, saved.rows
+    n = min(len(path.stamps_ns), len(nodes.stamps_ns))
+    known = np.flatnonzero(path.stamps_ns[:n] == nodes.stamps_ns[:n])
+    frozen, poses = nodes.frozen.copy(), rows.poses.copy()
+    left, present = known[known < len(frozen)], known[known >= len(frozen)]
+    frozen[left] = path.poses[left]
+    at = np.searchsorted(rows.node_ids, nodes.ids[present])
+    found = at < len(rows.node_ids)
+    found[found] = rows.node_ids[at[found]] == nodes.ids[present][found]
+    poses[at[found]] = path.poses[present][found]
+    return replace(saved, nodes=nodes._replace(frozen=frozen), rows=rows._replace(poses=poses))
