@@ -139,11 +139,9 @@ class Journal:
     def _run(self) -> None:
         found = Found()
         try:
-            found = self._file.open(self._refusal)
+            found = self._file.read(self._refusal)
         except Exception as error:
             self._fail(error)
-            with contextlib.suppress(sqlite3.Error, OSError):
-                found = self._file.copied()
         self.found.set_result(found)
         while True:
             with self._condition:

@@ -11,6 +11,7 @@ of something else, is renamed and never written to; what can be read of it is in
 from collections.abc import Callable, Sequence
 import contextlib
 from dataclasses import dataclass, field
+import fcntl
 import hashlib
 import json
 import logging
@@ -20,7 +21,7 @@ import shutil
 import sqlite3
 from tempfile import TemporaryDirectory
 import time
-from typing import Any, get_type_hints, NamedTuple
+from typing import Any, get_type_hints, IO, NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,7 @@ logger = logging.getLogger(__name__)
 APPLICATION, VERSION = 0x506F4752, 1  # in the header of the file
 PART = 16_384   # largest size of a part of an array [bytes]
 INLINE = 64     # arrays of at most so many numbers are not cut out
+LARGEST_WAL = 2_000_000     # of the file beside it, in which SQLite writes first [bytes]
 PARTS = '#parts'    # key of the digests of an array's parts
 SCHEMA = '''
     CREATE TABLE part (digest BLOB PRIMARY KEY, content BLOB NOT NULL);
@@ -41,10 +43,6 @@ SCHEMA = '''
     CREATE TABLE log (row INTEGER PRIMARY KEY, number INTEGER, act INTEGER, digest BLOB NOT NULL,
                       content BLOB NOT NULL, moved BLOB NOT NULL);
 '''
-# Errors of SQLite that say nothing of the contents of a file: what is around it is wrong.
-AROUND = {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_FULL,
-          sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_PERM,
-          sqlite3.SQLITE_NOMEM}
 MOVED = np.dtype([('node', '<i8'), ('stamp_ns', '<i8'), ('pose', '<f8', 3)])
 NOT_MOVED = np.empty(0, MOVED)
 
@@ -128,57 +126,52 @@ class JournalFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._lock: IO[bytes] | None = None  # of the process that uses the file
         self._connection: sqlite3.Connection | None = None
         self._identity: tuple[int, int] | None = None
         self._is_read = False  # whether there is nothing in the file that was never read
         self._parts: set[bytes] = set()  # digests of those in the file
-        self._row, self._path = 0, KnownPath()  # the last ones in the log
+        self._path = KnownPath()  # the last one in the file
 
     @property
     def size(self) -> int:
         """Size of the file and of those that SQLite has beside it [bytes]."""
         return sum(each.stat().st_size for each in _files(self.path) if each.exists())
 
-    def open(self, refusal: Callable[[SavedGraph], str | None]) -> Found:
-        """Return what is in the file; a bad one, or one that is refused, is renamed."""
-        found = Found()
-        try:
-            connection = self._connect()
-            found, self._row = _read(connection)
-        except sqlite3.Error as error:
-            if not _is_damage(error):
-                self.close()
-                raise
-            found = Found(trouble=f'it is damaged, or no journal: {error}')
-        except FileFormatError as error:
-            found = Found(trouble=str(error))
-        self._is_read = True
+    def read(self, refusal: Callable[[SavedGraph], str | None]) -> Found:
+        """
+        Return what is in the file; a bad one, or one that is refused, is renamed.
+
+        A copy is read, as SQLite would change a file that it opens. Where the file cannot be
+        written, it is read all the same.
+        """
+        with contextlib.suppress(PermissionError, FileNotFoundError):
+            self._claim()
+        if not any(path.exists() for path in _files(self.path)):
+            return Found()
+        with TemporaryDirectory() as folder:
+            copy = Path(folder, self.path.name)
+            for path, other in zip(_files(self.path), _files(copy), strict=True):
+                if path.exists():
+                    shutil.copy(path, other)
+            found = _found(copy)
         if found.state is not None and (refused := refusal(found.state.saved)) is not None:
             found = Found(trouble=refused)
         if found.trouble != '':
             self._set_aside(found.trouble)
             self.write(Batch(
                 entries=[*found.entries], path=found.path, checkpoint=found.state))
+        self._is_read = True
         return found
-
-    def copied(self) -> Found:
-        """Return what is in a file that cannot be written to, by a copy of it."""
-        with TemporaryDirectory() as folder:
-            for path in _files(self.path):
-                if path.exists():
-                    shutil.copy(path, folder)
-            copy = JournalFile(Path(folder, self.path.name))
-            try:
-                return copy.open(lambda _: None)
-            finally:
-                copy.close()
 
     def close(self) -> None:
         """Close the file, which the next `write` opens again."""
         if self._connection is not None:
             with contextlib.suppress(sqlite3.Error):
                 self._connection.close()
-        self._connection = None
+        if self._lock is not None:
+            self._lock.close()
+        self._connection = self._lock = None
 
     @property
     def is_lost(self) -> bool:
@@ -187,10 +180,14 @@ class JournalFile:
 
     def write(self, batch: Batch) -> None:
         """Write a batch in one transaction."""
-        if self._connection is None and not self._is_read and self.path.exists():
-            self._connect().close()     # nobody else has it
-            self._set_aside('it could not be read at the start')
-        connection = self._connection or self._connect()
+        connection = self._connection
+        if connection is None:
+            self._claim()
+            if not self._is_read and self.path.exists():
+                self._set_aside('it could not be read at the start')
+            connection, self._parts = _connected(self.path)
+            self._connection, self._identity = connection, _identity(self.path)
+            self._is_read = True
         parts = self._parts
         try:
             connection.execute('BEGIN IMMEDIATE')
@@ -212,47 +209,32 @@ class JournalFile:
         except BaseException:
             self.close()    # which rolls back
             raise
-        self._parts, self._is_read = parts, True
+        self._parts = parts
         if batch.checkpoint is not None:
             connection.execute('PRAGMA incremental_vacuum').fetchall()
+        if batch.checkpoint is not None or _files(self.path)[1].stat().st_size > LARGEST_WAL:
             connection.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
 
     def _log(self, connection: sqlite3.Connection, last: tuple[int, int],
              entries: Sequence[Entry], moved: Any = NOT_MOVED) -> None:
-        self._row += 1
         content, change = json.dumps(entries).encode(), moved.tobytes()
-        connection.execute('INSERT INTO log VALUES (?, ?, ?, ?, ?, ?)', (
-            self._row, *last, _digest(content + change), content, change))
+        connection.execute(
+            'INSERT INTO log (number, act, digest, content, moved) VALUES (?, ?, ?, ?, ?)',
+            (*last, _digest(content + change), content, change))
 
-    def _connect(self) -> sqlite3.Connection:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        connection = sqlite3.connect(self.path, timeout=1.0, isolation_level=None)
-        try:
-            # one process has the file, and gives the space back that becomes free
-            for pragma in ('locking_mode = EXCLUSIVE', 'auto_vacuum = INCREMENTAL',
-                           'journal_mode = WAL', 'synchronous = FULL'):
-                connection.execute(f'PRAGMA {pragma}').fetchall()
-            application, version, n_tables = (
-                connection.execute(query).fetchone()[0] for query in (
-                    'PRAGMA application_id', 'PRAGMA user_version',
-                    'SELECT count(*) FROM sqlite_master'))
-            if n_tables == 0:
-                connection.executescript(
-                    f'BEGIN;{SCHEMA} PRAGMA application_id = {APPLICATION};'
-                    f'PRAGMA user_version = {VERSION}; COMMIT')
-            elif (application, version) != (APPLICATION, VERSION):
-                raise FileFormatError(f'expected a journal of version {VERSION}, got ' + (
-                    f'one of version {version}' if application == APPLICATION else
-                    'another SQLite file'))
-        except BaseException:
-            connection.close()
-            raise
-        self._connection, self._identity = connection, _identity(self.path)
-        self._parts, self._row, self._path = set(), 0, KnownPath()
-        return connection
+    def _claim(self) -> None:
+        """Keep other processes from using the file, as long as this one does."""
+        if self._lock is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            lock = self.path.with_name(self.path.name + '.lock').open('ab')
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                lock.close()
+                raise OSError('another process uses it') from error
+            self._lock = lock
 
     def _set_aside(self, why: str) -> None:
-        self.close()
         stamp = time.strftime('%Y%m%dT%H%M%S', time.gmtime())
         names = (f'{self.path.name}.bad-{stamp}' + ('' if k == 0 else f'-{k}')
                  for k in range(1000))
@@ -264,8 +246,63 @@ class JournalFile:
                      aside.name)
 
 
+def _connected(path: Path) -> tuple[sqlite3.Connection, set[bytes]]:
+    """Return a connection to a file that may be new, and the digests of its parts."""
+    connection = sqlite3.connect(path, timeout=1.0, isolation_level=None)
+    try:
+        # without files shared with others, and giving the space back that becomes free
+        for pragma in ('locking_mode = EXCLUSIVE', 'auto_vacuum = INCREMENTAL',
+                       'journal_mode = WAL', 'synchronous = FULL', 'wal_autocheckpoint = 0'):
+            connection.execute(f'PRAGMA {pragma}').fetchall()
+        application, version, n_tables = (
+            connection.execute(query).fetchone()[0] for query in (
+                'PRAGMA application_id', 'PRAGMA user_version',
+                'SELECT count(*) FROM sqlite_master'))
+        if n_tables == 0:
+            connection.executescript(
+                f'BEGIN;{SCHEMA} PRAGMA application_id = {APPLICATION};'
+                f'PRAGMA user_version = {VERSION}; COMMIT')
+        elif (application, version) != (APPLICATION, VERSION):
+            raise FileFormatError(f'expected a journal of version {VERSION}, got ' + (
+                f'one of version {version}' if application == APPLICATION else
+                'another SQLite file'))
+        return connection, {digest for digest, in connection.execute('SELECT digest FROM part')}
+    except BaseException:
+        connection.close()
+        raise
+
+
+def _found(path: Path) -> Found:
+    """Return what is in a file, which SQLite may change."""
+    n_commits = _n_commits(_files(path)[1])
+    try:
+        connection, _ = _connected(path)
+    except (sqlite3.Error, FileFormatError) as error:
+        return Found(trouble=f'it is damaged, or no journal: {error}')
+    with contextlib.closing(connection):
+        try:
+            found = _read(connection)
+            # what is behind a bad frame of the log is for SQLite a commit that was not ended
+            _, n_whole, _ = connection.execute('PRAGMA wal_checkpoint(PASSIVE)').fetchone()
+        except sqlite3.Error as error:
+            return Found(trouble=f'it is damaged: {error}')
+    return found if found.trouble != '' or n_whole >= n_commits else found._replace(
+        trouble=f'its newest part is damaged: of {n_commits} pages {n_whole} are whole')
+
+
 def _files(path: Path) -> list[Path]:
     return [path.with_name(path.name + suffix) for suffix in ('', '-wal', '-shm')]
+
+
+def _n_commits(wal: Path) -> int:
+    """Return the number of frames in a write-ahead log up to the last one that ends a commit."""
+    content = wal.read_bytes() if wal.exists() else b''
+    page = int.from_bytes(content[8:12])
+    if not 512 <= page <= 65_536:
+        return len(content)     # a damaged header, or an empty file
+    ends = range(32 + 24 + page, len(content) + 1, 24 + page)
+    return max((k for k, end in enumerate(ends, 1) if any(
+        content[end - page - 20:end - page - 16])), default=0)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -330,21 +367,21 @@ def _with(path: KnownPath, moves: Any) -> KnownPath:
     return changed
 
 
-def _read(connection: sqlite3.Connection) -> tuple[Found, int]:
-    """Return what is in a file, as far as it is whole, and the last row of its log."""
+def _read(connection: sqlite3.Connection) -> Found:
+    """Return what is in a file, as far as it is whole."""
     check = ' '.join(connection.execute('PRAGMA integrity_check(1)').fetchone()[0].split())
     trouble = '' if check == 'ok' else f'it is damaged: {check}'
     try:
         state = _read_state(connection)
     except (*sc.MISMATCHES, FileFormatError, sqlite3.Error) as error:
-        return Found(trouble=trouble or f'its state is damaged: {error!r}'), 0
+        return Found(trouble=trouble or f'its state is damaged: {error!r}')
     known = KnownPath() if state is None else KnownPath(
         state.saved.nodes.stamps_ns, state.saved.path)
     begin = (0, 0) if state is None else state.last
-    (number, act), row, path, entries = begin, 0, known, list[Entry]()
+    (number, act), path, entries = begin, known, list[Entry]()
     try:
-        for row, digest, content, change in connection.execute(  # noqa: B007
-                'SELECT row, digest, content, moved FROM log ORDER BY row'):
+        for digest, content, change in connection.execute(
+                'SELECT digest, content, moved FROM log ORDER BY row'):
             _check(digest, content + change)
             for entry in (Entry(*item) for item in json.loads(content)):
                 if entry[:2] <= begin:
@@ -358,7 +395,7 @@ def _read(connection: sqlite3.Connection) -> tuple[Found, int]:
     except (*sc.MISMATCHES, FileFormatError, sqlite3.Error) as error:
         trouble = trouble or f'its log is damaged: {error}'
     return Found(state, sorted(entries, key=lambda each: each[:2]),
-                 KnownPath() if path is known else path, (number, act), trouble), row
+                 KnownPath() if path is known else path, (number, act), trouble)
 
 
 def _read_state(connection: sqlite3.Connection) -> Checkpoint | None:
@@ -385,6 +422,3 @@ def _check(digest: bytes, content: bytes) -> None:
     if _digest(content) != digest:
         raise FileFormatError('a row does not have its SHA-256')
 
-
-def _is_damage(error: sqlite3.Error) -> bool:
-    return error.sqlite_errorcode & 0xFF not in AROUND

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal: whatever happens to process and file, the drive goes on from what was accepted."""
 
+from collections.abc import Iterator
 from pathlib import Path
 import shutil
 
@@ -14,7 +15,7 @@ from test_delay_invariance import CONFIGS, drive, SAME_PATH
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.io.journal import Journal
-from pose_graph_ros.core.io.journal_file import KnownPath
+from pose_graph_ros.core.io.journal_file import Found, JournalFile, KnownPath
 from pose_graph_ros.core.recovery import recovered
 
 PERIOD = 0.02   # [s]
@@ -100,3 +101,72 @@ def test_a_drive_with_kills_ends_like_one_without(
         backend.optimize()
     np.testing.assert_allclose(
         path_of(one.backend).poses, path_of(whole).poses, rtol=0, atol=SAME_PATH)
+
+
+# --- files that are not whole, or cannot be written ----------------------------------------------
+
+@pytest.fixture(scope='module')
+def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
+    """Yield a drive that was killed, with a checkpoint and a log in its file."""
+    stream = events('plain')
+    one = Drive(tmp_path_factory.mktemp('written'), CONFIGS['plain'])
+    for k, event in enumerate(stream):
+        one.feed(event)
+        if k % 10 == 0:
+            one.update()
+        if k == 300:
+            one.checkpoint()
+        if k % 100 == 99:
+            one.keep_path()
+    one.keep_path()
+    yield one
+    one.journal.close(5.0)
+
+
+def copied(of: Drive, folder: Path) -> list[Path]:
+    return [Path(shutil.copy(path, folder)) for path in sorted(of.path.parent.glob('state.db*'))]
+
+
+def opened(folder: Path) -> Found:
+    file = JournalFile(folder / 'state.db')
+    try:
+        return file.read(lambda _: None)
+    finally:
+        file.close()
+
+
+def test_flipped_bits_are_noticed_or_without_effect(written: Drive, tmp_path: Path) -> None:
+    copied(written, tmp_path)
+    whole, rng = opened(tmp_path), np.random.default_rng(0)
+    assert whole.trouble == ''
+    assert whole.state is not None
+    assert len(whole.path.poses) > 0
+    n_bad = 0
+    for k in range(1000):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        paths = copied(written, folder)
+        sizes = [path.stat().st_size for path in paths]
+        at = int(rng.integers(sum(sizes)))
+        path = next(path for path, end in zip(paths, np.cumsum(sizes), strict=True) if at < end)
+        content = bytearray(path.read_bytes())
+        content[at % len(content)] ^= 1 << int(rng.integers(8))
+        path.write_bytes(content)
+        before = {path.name: path.read_bytes() for path in paths}
+        found = opened(folder)
+        # what is read is right
+        n = len(found.entries)
+        assert [*found.entries] == [*whole.entries[:n]] or found.state is None
+        if found.trouble == '':
+            assert (n, found.last) == (len(whole.entries), whole.last)
+            np.testing.assert_array_equal(found.path.poses, whole.path.poses)
+        else:
+            n_bad += 1
+            aside = {path.name.partition('.bad-')[0] + (
+                '-wal' if path.name.endswith('-wal') else ''): path.read_bytes()
+                for path in folder.glob('*.bad-*')}
+            assert aside['state.db'] == before['state.db'], 'the bad file is as it was'
+            again = opened(folder)
+            assert (again.trouble, len(again.entries), again.last) == ('', n, found.last)
+        shutil.rmtree(folder)
+    assert n_bad > 500
