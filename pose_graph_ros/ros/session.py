@@ -83,9 +83,10 @@ class Session:
         graph = self.out.graph
         self.worker = worker = Worker(
             backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare,
-            None if self.journal is None else self.journal.begin())
+            None if self.journal is None else self.journal.begin(has_state=resumes))
         worker.thread.start()
         if resumes:
+            self._keep_state()
             self.worker.request_update()
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
@@ -157,10 +158,12 @@ class Session:
         self.out.close()
 
     def _keep_state(self) -> 'Future[None]':
-        """Make the worker's thread write the state of the engine into the journal."""
-        worker, plane = self.worker, self.input.reader.datum.plane
-        return worker.call(lambda _: worker.keep_state(None if plane is None else plane.origin),
-                           'the state for the journal')
+        """Make the worker's thread hand the state of the engine to the journal, if it exists."""
+        worker, datum = self.worker, self.input.reader.datum
+
+        def keep(_: PoseGraphBackend) -> None:
+            worker.keep_state(None if datum.plane is None else datum.plane.origin)
+        return worker.call(keep, 'the state for the journal')
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""

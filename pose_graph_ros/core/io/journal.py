@@ -46,8 +46,9 @@ LONGEST_WAIT = 0.5  # of a path for the disk [s]
 class Chapter:
     """What one worker writes to the journal; that of a later one replaces it."""
 
-    def __init__(self, journal: 'Journal', number: int) -> None:
+    def __init__(self, journal: 'Journal', number: int, *, awaits_state: bool = False) -> None:
         self._journal, self.number = journal, number
+        self.awaits_state = awaits_state  # whether nothing is written before a checkpoint
         self.base = 0, 0  # of measurements and acts that were found; set by the journal's thread
         self.taken = self._posted = self._acts = 0
         self._is_changed, self._cost, self._checked_at = True, 0.0, time.monotonic()
@@ -82,6 +83,10 @@ class Chapter:
             saved, [(source, plain(each)) for source, each in pending], (self.taken, self._acts)))
 
 
+Item = tuple[float, Chapter, Any, threading.Event]
+"""When something was handed over [s], by whom, what, and what says that it was written."""
+
+
 class Journal:
     """
     Writes a journal; `found` is what the file held.
@@ -97,17 +102,22 @@ class Journal:
         self.found = Future[Found]()
         self.failure, self.lag, self.has_gap = '', 0.0, False
         self._file, self._period, self._refusal = JournalFile(path), period, refusal
-        self._items = deque[tuple[float, Chapter, Any, threading.Event]]()
+        self._items = deque[Item]()
         self._condition = threading.Condition()
         self._is_wanted = self._closing = False
         self._n_chapters, self._chapter = 0, Chapter(self, 0)
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
 
-    def begin(self) -> Chapter:
-        """Return the next chapter: the first one continues what was found, others replace it."""
+    def begin(self, *, has_state: bool = False) -> Chapter:
+        """
+        Return the next chapter: the first one continues what was found, others replace it.
+
+        One whose engine has a state already replaces it with its first checkpoint.
+        """
         self._n_chapters += 1
-        chapter = Chapter(self, self._n_chapters)
+        chapter = Chapter(self, self._n_chapters,
+                          awaits_state=has_state and self._n_chapters > 1)
         self.put(chapter, None)
         return chapter
 
@@ -162,11 +172,17 @@ class Journal:
                 self._file.close()
                 return
 
-    def _batch(self, items: Sequence[tuple[float, Chapter, Any, object]], found: Found) -> Batch:
+    def _batch(self, items: Sequence[Item], found: Found) -> Batch:
         batch = Batch()
-        for _, chapter, item, _ in items:
+        for k, (_, chapter, item, _) in enumerate(items):
             if chapter.number < self._chapter.number:
                 continue
+            if item is None and chapter.awaits_state:
+                if not any(isinstance(each, Checkpoint) and of is chapter
+                           for _, of, each, _ in items[k:]):
+                    self._items.extendleft(reversed(items[k:]))
+                    break
+                chapter.awaits_state = False
             if item is None:
                 self._chapter = chapter
                 if chapter.number > 1:

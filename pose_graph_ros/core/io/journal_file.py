@@ -36,6 +36,7 @@ APPLICATION, VERSION = 0x506F4752, 1  # in the header of the file
 PART = 16_384   # largest size of a part of an array [bytes]
 INLINE = 64     # arrays of at most so many numbers are not cut out
 LARGEST_WAL = 2_000_000     # of the file beside it, in which SQLite writes first [bytes]
+ENDING = 20     # tenths of a second for which a process that ends may still have the file
 PARTS = '#parts'    # key of the digests of an array's parts
 SCHEMA = '''
     CREATE TABLE part (digest BLOB PRIMARY KEY, content BLOB NOT NULL);
@@ -145,8 +146,12 @@ class JournalFile:
         A copy is read, as SQLite would change a file that it opens. Where the file cannot be
         written, it is read all the same.
         """
-        with contextlib.suppress(PermissionError, FileNotFoundError):
+        try:
             self._claim()
+        except BlockingIOError:
+            raise
+        except OSError:     # which the first `write` will tell
+            pass
         if not any(path.exists() for path in _files(self.path)):
             return Found()
         with TemporaryDirectory() as folder:
@@ -227,11 +232,15 @@ class JournalFile:
         if self._lock is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self.path.with_name(self.path.name + '.lock').open('ab')
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                lock.close()
-                raise OSError('another process uses it') from error
+            for left in range(ENDING - 1, -1, -1):
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError as error:
+                    if left == 0:
+                        lock.close()
+                        raise BlockingIOError('another process uses it') from error
+                    time.sleep(0.1)
             self._lock = lock
 
     def _set_aside(self, why: str) -> None:

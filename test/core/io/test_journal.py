@@ -3,22 +3,28 @@
 """The journal: whatever happens to process and file, the drive goes on from what was accepted."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+import os
 from pathlib import Path
+import resource
 import shutil
+import sqlite3
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from saved_graphs import Event, feed
+from saved_graphs import Event, feed, LINE_ODOMETRY, line_sample
 from test_delay_invariance import CONFIGS, drive, SAME_PATH
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.config import BackendConfig, WindowConfig
+from pose_graph_ros.core.io import journal_file
 from pose_graph_ros.core.io.journal import Journal
 from pose_graph_ros.core.io.journal_file import Found, JournalFile, KnownPath
 from pose_graph_ros.core.recovery import recovered
 
 PERIOD = 0.02   # [s]
+FLIPS = int(os.environ.get('POSE_GRAPH_FLIPS', '40'))
 
 
 def no_place(*_: float) -> np.ndarray:
@@ -142,7 +148,7 @@ def test_flipped_bits_are_noticed_or_without_effect(written: Drive, tmp_path: Pa
     assert whole.state is not None
     assert len(whole.path.poses) > 0
     n_bad = 0
-    for k in range(1000):
+    for k in range(FLIPS):
         folder = tmp_path / str(k)
         folder.mkdir()
         paths = copied(written, folder)
@@ -169,4 +175,123 @@ def test_flipped_bits_are_noticed_or_without_effect(written: Drive, tmp_path: Pa
             again = opened(folder)
             assert (again.trouble, len(again.entries), again.last) == ('', n, found.last)
         shutil.rmtree(folder)
-    assert n_bad > 500
+    assert n_bad > FLIPS // 2
+
+
+def driven(one: Drive, n: int) -> None:
+    """Drive a straight line of n samples on, and wait until that is on the disk."""
+    begin = one.chapter.taken
+    for k in range(begin, begin + n):
+        one.feed(Event('odom', line_sample(1.0 + 0.1 * k)))
+    one.update()
+    one.keep_path()
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Iterator[Drive]:
+    one = Drive(tmp_path, LINE_ODOMETRY)
+    driven(one, 50)
+    yield one
+    one.journal.close(5.0)
+
+
+def test_a_full_disk_is_told_and_nothing_is_missing_when_there_is_room_again(
+    begun: Drive, caplog: pytest.LogCaptureFixture,
+) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (begun.journal.size // 2, hard))
+    try:
+        driven(begun, 50)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert begun.journal.failure != ''
+    assert 'the journal cannot be written' in caplog.text
+    driven(begun, 50)
+    begun.checkpoint()
+    driven(begun, 50)
+    assert begun.journal.failure == ''
+    then = begun.killed()
+    assert then.found.trouble == ''
+    np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    then.journal.close(5.0)
+
+
+def test_a_file_that_is_removed_is_written_anew(begun: Drive) -> None:
+    for path in begun.path.parent.iterdir():
+        path.unlink()
+    driven(begun, 50)
+    begun.checkpoint()
+    driven(begun, 50)
+    then = begun.killed()
+    np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    then.journal.close(5.0)
+
+
+def test_a_file_in_use_is_left_alone(begun: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_file, 'ENDING', 1)
+    other = Drive(begun.path.parent, LINE_ODOMETRY)
+    driven(other, 10)
+    other.checkpoint()
+    other.keep_path()
+    assert 'another process uses it' in other.journal.failure
+    other.journal.close(5.0)
+    driven(begun, 50)
+    then = begun.killed()
+    np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    then.journal.close(5.0)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    one = Drive(Path('/proc'), LINE_ODOMETRY)
+    driven(one, 10)
+    assert '/proc/state.db: ' in one.journal.failure
+    assert caplog.text.count('the journal cannot be written') == 1
+    one.journal.close(5.0)
+
+
+@pytest.mark.parametrize(('change', 'said'), [
+    ('PRAGMA user_version = 2', 'expected a journal of version 1, got one of version 2'),
+    ('PRAGMA application_id = 5', 'got another SQLite file')])
+def test_files_of_others_are_set_aside(
+    begun: Drive, tmp_path: Path, change: str, said: str,
+) -> None:
+    folder = tmp_path / 'other'
+    folder.mkdir()
+    begun.journal.close(5.0)
+    copied(begun, folder)
+    with sqlite3.connect(folder / 'state.db') as connection:
+        connection.execute(change)
+    connection.close()
+    content = (folder / 'state.db').read_bytes()
+    found = opened(folder)
+    assert said in found.trouble
+    assert found.last == (0, 0)
+    aside, = folder.glob('*.bad-*')
+    assert aside.read_bytes() == content
+
+
+def test_the_file_shrinks_with_the_graph(tmp_path: Path) -> None:
+    one = Drive(tmp_path, LINE_ODOMETRY)
+
+    def size_after(n: int) -> int:
+        driven(one, n)
+        one.checkpoint()
+        one.keep_path()
+        return one.journal.size
+    before = size_after(10_000)
+    one.backend.configure(replace(LINE_ODOMETRY, window=WindowConfig(nodes=50)))
+    for _ in range(20):
+        size_after(20)
+    assert size_after(10) < before // 2
+    one.journal.close(5.0)
+
+
+def test_a_chapter_with_a_state_replaces_the_one_before_with_its_first_checkpoint(
+    begun: Drive,
+) -> None:
+    length = len(path_of(begun.backend).poses)
+    begun.chapter = begun.journal.begin(has_state=True)
+    driven(begun, 10)
+    then = begun.killed()
+    assert len(path_of(then.backend).poses) == length
+    then.journal.close(5.0)
