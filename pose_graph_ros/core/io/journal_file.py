@@ -216,7 +216,8 @@ class JournalFile:
             raise
         self._parts = parts
         if batch.checkpoint is not None:
-            connection.execute('PRAGMA incremental_vacuum').fetchall()
+            # `execute` would give one page back, as it does one step
+            connection.executescript('PRAGMA incremental_vacuum')
         if batch.checkpoint is not None or _files(self.path)[1].stat().st_size > LARGEST_WAL:
             connection.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
 
