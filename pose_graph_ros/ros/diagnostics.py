@@ -54,6 +54,8 @@ def values(session: 'Session') -> dict[str, object]:
                   'journal.is_whole': int(not journal.has_gap)}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
+    if session.replaced is not None:
+        found['undo'] = session.replaced
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}

@@ -5,7 +5,8 @@ From messages to measurements, with a count for everything; imports no rclpy.
 
 What is noticed as messages arrive, rates, silence, delays and refusals of sources, are `Arrivals`.
 
-While it is in doubt whether time begins again, as `TimeKeeper` judges, all messages are held back,
+Time begins again if the clock was set back, or if `TimeKeeper` finds it in the stamps and the
+publishers are others than before. While that is in doubt all messages are held back,
 so that no measurement of the new time reaches the old graph, and afterwards those of the old time
 that are still in the queues are recognised.
 """
@@ -188,11 +189,43 @@ class Decision(NamedTuple):
     is_old: bool = False  # whether the message is from before time began again
 
 
+class Senders:
+    """Knows which publishers, by their ids, odometry of the present comes from."""
+
+    def __init__(self, find: Callable[[str], Collection[bytes]]) -> None:
+        self._find = find   # returns those that a source has now; takes 30 us
+        self._known: dict[str, set[bytes]] = {}
+        self._noted_at: dict[str, Seconds] = {}
+        self.strangers_may = True  # whether time may begin again with a source that is not known
+
+    def note(self, source: str) -> None:
+        """Note, at most once a second, who sends a source now if none that is known is left."""
+        now = time.monotonic()
+        if now - self._noted_at.get(source, -math.inf) >= 1.0:
+            self._noted_at[source], found = now, set(self._find(source))
+            # another beside those that go on need not have sent anything
+            if self._known.setdefault(source, found).isdisjoint(found) and len(found) > 0:
+                self._known[source] = found
+
+    def forget(self) -> None:
+        """Let the next who are noted be those that are known."""
+        self._known.clear()
+        self._noted_at.clear()
+
+    def have_changed(self, source: str) -> bool:
+        """Tell whether all that are known have gone, and there are others."""
+        if (known := self._known.get(source)) is None:
+            return self.strangers_may
+        found = self._find(source)
+        return len(known) > 0 and len(found) > 0 and known.isdisjoint(found)
+
+
 class TimeJumps:
     """Holds messages back while the keeper of time is in doubt."""
 
-    def __init__(self, keeper: TimeKeeper) -> None:
-        self._keeper = keeper
+    def __init__(self, keeper: TimeKeeper, senders: Senders) -> None:
+        self._keeper, self.senders = keeper, senders
+        keeper.may_begin_again = senders.have_changed
         self._held: list[ReceivedMessage] = []
         self._drained: set[str] | None = None
         """Sources that have sent messages of the new time; None if no old ones are expected."""
@@ -206,11 +239,14 @@ class TimeJumps:
         judged = self._keeper.judge(received.source, received.measurement)
         received = received._replace(refusal=judged.refusal)
         if judged.jump_ns > 0:
+            self.senders.forget()
             self._expect_old(newest_ns, judged.jump_ns, {received.source})
             return Decision(self.release(received), judged.jump_ns)
         if self._keeper.in_doubt and len(self._held) < 10_000:
             self._held.append(received)
             return Decision([])
+        if judged.refusal is None and isinstance(received.measurement, OdometrySample):
+            self.senders.note(received.source)
         return Decision(self.release(received))
 
     def release(self, *more: ReceivedMessage) -> list[ReceivedMessage]:
@@ -221,6 +257,7 @@ class TimeJumps:
     def forget(self) -> None:
         """Forget all stamps; messages that are held back stay so."""
         self._keeper.forget()
+        self.senders.forget()
         self._drained = None
 
     def clock_jumped(self, back_ns: int, clock_ns: int) -> None:
@@ -260,9 +297,10 @@ class TimeJumps:
 class Input:
     """Counts all messages, holds them back while time may have jumped back, and reads them."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Mapping[str, Any],
+                 publishers: Callable[[str], Collection[bytes]]) -> None:
         self.reader = MessageReader(values)
-        self.time_jumps = TimeJumps(self.reader.keeper)
+        self.time_jumps = TimeJumps(self.reader.keeper, Senders(publishers))
         self._told: set[tuple[str, str]] = set()
         self._odometry_at = 0.0
         self.paused = False  # whether all measurements are rejected
@@ -280,9 +318,18 @@ class Input:
         self.posted_at = time.monotonic()  # time of the last of them, by a monotonic clock [s]
         self.is_streaming = False  # whether any were posted since the final optimisation
 
-    def start_new_graph(self, values: Mapping[str, Any]) -> None:
-        """Forget all messages but those of /tf_static; those that are held back stay so."""
-        self.reader = MessageReader(values, self.reader.frames, self.reader.keeper)
+    def start_new_graph(self, values: Mapping[str, Any],
+                        reader: MessageReader | None = None) -> None:
+        """
+        Forget all messages but those of /tf_static; those that are held back stay so.
+
+        They are read on by the reader of an earlier graph, if it is given, with its datum.
+        """
+        if reader is None:
+            reader = MessageReader(values, self.reader.frames, self.reader.keeper)
+        else:
+            reader.configure(values)
+        self.reader = reader
         self._clear()
 
     def receive(self, source: str, message: Message) -> Decision:

@@ -49,6 +49,7 @@ class Services:
                          context=node.context, use_global_arguments=False, enable_rosout=False,
                          start_parameter_services=False)
         for name, act in (('optimize', self._optimize), ('set_datum', self._set_datum),
+                          ('undo_reset', self._undo_reset),
                           ('save_graph', self._with_file(self._save)),
                           ('load_graph', self._with_file(self._load))):
             self._own.create_service(Trigger, name, self._answering(act))
@@ -113,7 +114,40 @@ class Services:
         plane = self._session.input.reader.datum.plane
         return True, f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; ' + (
             'the next good fix will be the datum' if plane is None else
-            f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]')
+            f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]') + (
+            '' if self._session.replaced is None else
+            f'; what can be brought back: {self._session.replaced}')
+
+    def _undo_reset(self, _: Trigger.Request) -> Answer:
+        session, replaced = self._session, self._session.replaced
+        if replaced is None:
+            return False, 'refused: no graph was replaced, or it is back already'
+        # in the middle of an update it has no graph that can go on
+        if not replaced.worker.stop(30.0):
+            return False, 'refused: the solver still works on that graph: call again'
+
+        def bring_back() -> None:
+            if self._closed or session.replaced is not replaced:
+                raise CancelledError
+            session.undo_reset(replaced)
+        self._do_in_callbacks(bring_back)
+        return True, f'{replaced.n_hidden} hidden nodes are back' + (
+            '' if session.replaced is None else f'; the graph in exchange: {session.replaced}')
+
+    def _do_in_callbacks(self, act: Callable[[], None]) -> None:
+        """Do something in the thread of the node's callbacks, and wait for it."""
+        done: Future[None] = Future()
+
+        def settle() -> None:
+            try:
+                act()
+            except BaseException as error:
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+        assert self._node.executor is not None, 'a node that is served is spun'
+        self._node.executor.create_task(settle)
+        done.result()
 
     def _pause(self, request: SetBool.Request) -> Answer:
         before, self._session.input.paused = self._session.input.paused, request.data
@@ -179,24 +213,16 @@ class Services:
         # wait until the worker has prepared the kernels, which reading needs
         worker.call(lambda _: None).result()
         saved, backend = restored(path, backend_config(session.values))
-        done: Future[None] = Future()
 
         def replace() -> None:
-            try:
-                # in the meantime a datum or parameters may have been set
-                self._require_present(worker)
-                datum = session.input.reader.datum
-                origin = None if datum.plane is None else datum.plane.origin
-                if (refusal := site_refusal(
-                        saved, *((origin, None) if datum.is_given else (None, origin)))):
-                    raise FileFormatError(refusal)
-                backend.configure(backend_config(session.values))
-                session.load(saved, backend, str(path))
-            except BaseException as error:
-                done.set_exception(error)
-            else:
-                done.set_result(None)
-        assert self._node.executor is not None, 'a node that is served is spun'
-        self._node.executor.create_task(replace)    # in the thread of the node's callbacks
-        done.result()
+            # in the meantime a datum or parameters may have been set
+            self._require_present(worker)
+            datum = session.input.reader.datum
+            origin = None if datum.plane is None else datum.plane.origin
+            if (refusal := site_refusal(
+                    saved, *((origin, None) if datum.is_given else (None, origin)))):
+                raise FileFormatError(refusal)
+            backend.configure(backend_config(session.values))
+            session.load(saved, backend, str(path))
+        self._do_in_callbacks(replace)
         return f'{len(saved.nodes.ids)} hidden nodes from {path}, datum {saved.datum or "none"}'

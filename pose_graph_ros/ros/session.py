@@ -14,7 +14,7 @@ from functools import partial
 import logging
 import math
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
@@ -23,7 +23,13 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import backend_config, CLOCK_JUMP_NS, SET_POSE, Source
+from pose_graph_ros.adapters.sources import (
+    backend_config,
+    CLOCK_JUMP_NS,
+    MessageReader,
+    SET_POSE,
+    Source,
+)
 from pose_graph_ros.core import measurements, quantities
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
@@ -38,6 +44,21 @@ logger = logging.getLogger(__name__)
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
 
 
+class Replaced(NamedTuple):
+    """A graph that was replaced, as long as it can be brought back."""
+
+    worker: Worker  # which was told to end
+    reader: MessageReader  # with the datum
+
+    @property
+    def n_hidden(self) -> int:
+        """Number of its hidden nodes, by the newest estimate."""
+        return 0 if self.worker.estimate is None else self.worker.estimate.n_hidden
+
+    def __str__(self) -> str:
+        return f'{self.n_hidden} hidden nodes, by ~/undo_reset'
+
+
 class Session:
     """Inputs, graph and outputs of the node, from its configuration to its clean-up."""
 
@@ -45,10 +66,12 @@ class Session:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
         path, datum = initial_graph(values)
-        self.input, self.out = Input(values), publishers.Publishers(node, values)
+        self.input = Input(values, self._publishers)
+        self.out = publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
+        self.replaced: Replaced | None = None  # the newest graph with odometry that was replaced
         self._told: dict[str, str] = {}  # what is logged and not over, by its text without numbers
         self.activated_at = math.inf  # by a monotonic clock [s]
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
@@ -78,6 +101,7 @@ class Session:
         self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
                             for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
+        self.input.time_jumps.senders.strangers_may = not resumes
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()
         graph = self.out.graph
@@ -256,6 +280,11 @@ class Session:
         self.input.time_jumps.forget()
         self._start_new_graph('a call of ~/reset')
 
+    def _publishers(self, source: str) -> set[bytes]:
+        """Return the ids of those who publish the topic of a source."""
+        topic = self.input.reader.sources[source].topic
+        return {bytes(info.endpoint_gid) for info in self.node.get_publishers_info_by_topic(topic)}
+
     def _start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
         """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
         self._replace(PoseGraphBackend(self._config), f'a new graph was started: {reason}')
@@ -272,12 +301,28 @@ class Session:
         if saved.datum is not None:
             self.input.reader.datum.keep(saved.datum)
 
-    def _replace(self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False) -> None:
-        logger.warning('%s', reason, extra=log.ANSWER)
+    def undo_reset(self, replaced: Replaced) -> None:
+        """Exchange the graph for the one that was replaced, whose worker has ended."""
+        backend, rest = replaced.worker.rest()
+        backend.configure(self._config)
+        self.input.time_jumps.forget()
+        self.replaced = None
+        self._replace(backend, 'the graph before is back: a call of ~/undo_reset', resumes=True,
+                      reader=replaced.reader)
+        for source, measurement in rest:
+            self.worker.post(source, measurement)
+
+    def _replace(self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False,
+                 reader: MessageReader | None = None) -> None:
+        """Replace the graph, and its reader if one is given; keep the one so far for an undo."""
         prepared = self.worker.prepared
-        self.worker.stop(0.0)  # the result of a running solve is discarded
+        self.worker.stop(0.0)  # of a running solve nothing is published
+        if self.worker.has_odometry or self.is_loaded:
+            self.replaced = Replaced(self.worker, self.input.reader)
+        logger.warning('%s%s', reason, '' if self.replaced is None else (
+            f'; what can be brought back: {self.replaced}'), extra=log.ANSWER)
         self.out.start_new_graph()
-        self.input.start_new_graph(self.values)
+        self.input.start_new_graph(self.values, reader)
         self._set_pose_input.waiting = None
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
         self._begin(backend, (lambda _: None) if prepared else self._warm_up, resumes=resumes)

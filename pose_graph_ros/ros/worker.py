@@ -84,6 +84,7 @@ class Worker:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
         self.chapter = chapter  # of the journal, if there is one
         self.prepared = False  # whether the preparation has ended
+        self.has_odometry = False  # whether any was posted
         self.is_optimal = False  # whether the whole graph was optimised since the last update
         self._inbox: deque[tuple[str, Measured]] = deque()
         self._update_wanted = False
@@ -93,9 +94,11 @@ class Worker:
         self._condition = threading.Condition()
         self._revision = backend.revision
         self.durations = 0, 0.0, 0.0  # number, sum and longest of updates with a solve [s]
-        self._jumps: Counter[str] = Counter()  # of odometries, that were told
+        # of odometries, that were told, also those of an engine that goes on
+        self._jumps = Counter({name: each.n_jumps for name, each in backend.odometry.items()})
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
-        self.status = WorkerStatus()  # the newest status; replaced as a whole
+        # the newest status; replaced as a whole
+        self.status = WorkerStatus(counts=Counter(backend.counts))
         self.thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
 
     def stop(self, timeout: float) -> bool:
@@ -107,6 +110,10 @@ class Worker:
         self.thread.join(timeout)
         return not self.thread.is_alive()
 
+    def rest(self) -> tuple[PoseGraphBackend, Sequence[tuple[str, Measured]]]:
+        """Return the engine and what it has not got, after the thread has ended."""
+        return self._backend, self._inbox
+
     def post(self, source: str, measurement: Measured) -> bool:
         """Return whether a measurement was handed over: not if the inbox is full."""
         with self._condition:
@@ -115,6 +122,7 @@ class Worker:
             self._inbox.append((source, measurement))
             if self.chapter is not None:
                 self.chapter.measured(source, measurement)
+            self.has_odometry = self.has_odometry or isinstance(measurement, ms.OdometrySample)
             if len(self._inbox) == 1:
                 self._condition.notify()
         return True
@@ -211,8 +219,9 @@ class Worker:
 
     def _process(self, batch: Collection[tuple[str, Measured]], *, wanted: bool) -> None:
         """Add measurements, and update the graph if that is wanted."""
-        for source, measurement in batch:
+        for k, (source, measurement) in enumerate(batch):
             if self._stopping:
+                self._inbox.extendleft(reversed([*batch][k:]))
                 return
             try:
                 if isinstance(measurement, ms.OdometrySample):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages are held back while time may begin again; none is lost, and none mixes two times."""
 
+import itertools
 from types import SimpleNamespace
 
 from hypothesis import given, strategies as st
@@ -10,13 +11,27 @@ import pytest
 
 from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
-from pose_graph_ros.ros.input import PoseContinuity, ReceivedMessage, TimeJumps
+from pose_graph_ros.ros import input as input_module
+from pose_graph_ros.ros.input import PoseContinuity, ReceivedMessage, Senders, TimeJumps
 
 SECOND = 1_000_000_000
 
 
-def made(*odometry: str) -> TimeJumps:
-    return TimeJumps(TimeKeeper(odometry or ('odom',), SECOND))
+class Topic:
+    """Who publishes the odometry; the test says it."""
+
+    def __init__(self, *publishers: bytes) -> None:
+        self.publishers = set(publishers)
+
+    def find(self, source: str) -> set[bytes]:
+        return self.publishers
+
+
+def made(*odometry: str, topic: Topic | None = None) -> TimeJumps:
+    """Return it for a topic whose publisher is another each time, or a given one."""
+    numbers = itertools.count()
+    return TimeJumps(TimeKeeper(odometry or ('odom',), SECOND), Senders(
+        (lambda _: {str(next(numbers)).encode()}) if topic is None else topic.find))
 
 
 def odometry(seconds: float, source: str = 'odom') -> ReceivedMessage:
@@ -113,6 +128,54 @@ def test_of_two_odometries_messages_of_the_old_time_are_not_mixed_with_the_new()
     assert decision.jump_ns > 54 * SECOND
     assert sent(decision.released) == sent(new)
     assert time_jumps.receive(odometry(105.3, 'visual')).is_old
+
+
+LAP = lap(100.0, 5.0)
+BURST = lap(50.0, 1.5)
+
+
+def test_without_another_publisher_stamps_behind_are_refused_and_hold_nothing_back() -> None:
+    topic = Topic(b'a')
+    time_jumps = made(topic=topic)
+    assert decide(time_jumps, LAP) == (sent(LAP), [])
+    topic.publishers = {b'a', b'b'}     # one beside it, which has sent them
+    decisions = [time_jumps.receive(each) for each in BURST]
+    assert all(decision.released[0].refusal.reason == 'stamp_leap' for decision in decisions)
+    assert decide(time_jumps, lap(105.0, 1.0)) == (sent(lap(105.0, 1.0)), [])
+    # it is only now found out that the other one has gone
+    topic.publishers = {b'b'}
+    released, jumps = decide(time_jumps, BURST)
+    assert (released, jumps) == (sent(BURST), [0])
+
+
+def test_a_publisher_that_goes_on_where_another_ended_is_known_from_then_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(input_module, 'time', SimpleNamespace(monotonic=lambda: clock.now))
+    topic = Topic(b'a')
+    time_jumps = made(topic=topic)
+    decide(time_jumps, LAP)
+    topic.publishers, clock.now = {b'b'}, 1.0
+    assert decide(time_jumps, lap(105.0, 1.0))[1] == []
+    assert decide(time_jumps, BURST)[1] == []
+    topic.publishers, clock.now = set(), 2.0    # what was in the queues when it ended
+    assert decide(time_jumps, [*lap(106.0, 1.0), *BURST])[1] == []
+    topic.publishers = {b'c'}
+    assert decide(time_jumps, BURST)[1] == [0]
+    # and so is the one with which time began again
+    assert decide(time_jumps, lap(52.0, 1.0))[1] == []
+    assert decide(time_jumps, lap(20.0, 1.5))[1] == []
+
+
+@pytest.mark.parametrize('is_loaded', [False, True])
+def test_preferred_odometry_that_comes_second_takes_no_graph_that_was_loaded_back(
+    is_loaded: bool,
+) -> None:
+    time_jumps = made('odom', 'visual', topic=Topic(b'a'))
+    time_jumps.senders.strangers_may = not is_loaded
+    decide(time_jumps, [odometry(100.0, 'visual')])
+    assert len(decide(time_jumps, BURST)[1]) == (not is_loaded)
 
 
 def drive(

@@ -60,8 +60,9 @@ class Given:
     """An input with the engine that it writes to."""
 
     def __init__(self, limit: int = 1000, **values: object) -> None:
+        self.publishers = {b'first'}
         self.values = {name.replace('__', '.'): value for name, value in values.items()}
-        self.input = Input(checked(self.values))
+        self.input = Input(checked(self.values), lambda _: self.publishers)
         self.engine = Engine(limit)
 
     def receive(self, source: str, message: object) -> Decision:
@@ -156,6 +157,7 @@ def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
 def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) -> None:
     given = Given()
     given.receive('odom', odometry(100.0))
+    given.publishers = {b'second'}
     given.receive('odom', odometry(50.0))
     given.receive('fix', fix(50.1))
     clock.now += 0.9 * LONGEST_DOUBT
@@ -165,12 +167,26 @@ def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) ->
     assert given.input.release_overdue() == []
 
 
+def test_stamps_that_begin_again_are_told_with_what_to_do(clock: Clock) -> None:
+    given = Given()
+    for at in (*range(100, 105), *range(50, 60)):
+        given.use('odom', odometry(float(at)))
+        clock.now += 1.0
+        given.input.watch(Counter({('odom', 'accepted'): given.input.posted}), {}, active=True)
+    assert given.rejected() == {'odom.stamp_leap': 10}
+    assert given.input.refused['odom'] == (
+        'the newest 10 messages of odom were refused: stamp_leap (59.000 s is 45.0 s behind those '
+        'before: if a new drive or loop of a bag is meant, call ~/reset, or play with --clock and '
+        'use_sim_time; else mend the clock of its driver, or set odom.time_offset)')
+
+
 def test_a_new_graph_forgets_all_but_what_is_held_back(caplog: pytest.LogCaptureFixture) -> None:
     given = Given()
     for step in range(20):
         given.use('odom', odometry(100.0 + 0.1 * step))
     given.use('fix', fix(101.0))
     given.use('fix', fix(101.0, status=-1))
+    given.publishers = {b'second'}
     given.use('odom', odometry(50.0))
     frames = given.input.reader.frames
     given.input.watch(Counter(), {}, active=True)

@@ -112,7 +112,7 @@ def malformed(topic: str) -> list[object]:
 def test_every_malformed_message_is_counted_and_none_shows() -> None:
     values = checked({'sources': ['odom', 'global_pose', 'fix', 'imu'], 'datum': [48.1, 11.6],
                       'odom.noise': 'twist'})
-    received, backend = Input(values), PoseGraphBackend(backend_config(values))
+    received, backend = Input(values, lambda _: ()), PoseGraphBackend(backend_config(values))
 
     def use(name: str, message: object) -> None:
         for each in received.receive(name, message).released:

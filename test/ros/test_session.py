@@ -5,6 +5,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+import threading
 from types import SimpleNamespace as Space
 
 import pytest
@@ -254,6 +255,57 @@ def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
     active.drive(6.0, 4.0, fixes=False)
     active.session.publish_diagnostics()
     assert active.health() == (OK, 'Running.')
+
+
+def test_a_graph_that_was_replaced_comes_back_with_all_that_was_posted_to_it(
+    active: Robot,
+) -> None:
+    active.drive(4.0)
+    session, plane = active.session, active.session.input.reader.datum.plane
+    saved = session.worker.call(lambda backend: backend.saved()).result(PATIENCE)
+    release = threading.Event()
+    session.worker.call(lambda _: release.wait(PATIENCE))
+    active.send('odom', *(odometry_at(4.0 + 0.1 * step) for step in range(20)))
+    first = session.worker
+    session.load(saved, PoseGraphBackend.restored(backend_config(session.values), saved), 'map')
+    release.set()
+
+    def undo() -> None:
+        assert session.replaced.worker.stop(PATIENCE)
+        session.undo_reset(session.replaced)
+    loaded = session.worker
+    undo()
+    assert session.worker.status.counts['fix', 'accepted'] == 8     # before it has done anything
+    active.wait(lambda: session.worker.status.counts['odom', 'accepted'] == 60, 'all are in it')
+    assert session.worker._backend is first._backend
+    assert session.input.reader.datum.plane is plane
+    active.drive(8.0, begin=6.0)
+    assert 'odom.jump' not in active.values()
+    # the other graph is the one that can be brought back now, and no empty one takes its place
+    assert session.replaced.worker is loaded
+    undo()
+    newest = session.worker
+    active.wait(lambda: newest.estimate is not None, 'it is back')
+    session.reset()
+    session.reset()
+    assert session.replaced.worker is newest
+    assert active.values()['undo'] == f'{len(saved.nodes.ids)} hidden nodes, by ~/undo_reset'
+
+
+@pytest.mark.parametrize('robot', [{
+    'sources': ['odom', 'fix', 'visual'], 'visual__type': 'odometry'}], indirect=True)
+def test_a_graph_that_was_loaded_is_not_taken_back_by_the_odometry_that_is_preferred(
+    active: Robot,
+) -> None:
+    active.publishers['visual'] = active.local.advertise(Odometry, 'visual')
+    active.drive(4.0)
+    session = active.session
+    saved = session.worker.call(lambda backend: backend.saved()).result(PATIENCE)
+    session.load(saved, PoseGraphBackend.restored(backend_config(session.values), saved), 'map')
+    active.send('visual', odometry_at(3600.0))
+    active.send('odom', *(odometry_at(4.0 + 0.1 * step) for step in range(20)))
+    assert session.n_resets == 1
+    assert active.values()['odom.stamp_leap'] == '20'
 
 
 @pytest.mark.parametrize('robot', [{

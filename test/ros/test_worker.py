@@ -91,6 +91,33 @@ def test_posting_never_waits_for_the_solver(
     wait_until(lambda: worker.status.processed == 39)
 
 
+def test_what_a_worker_that_is_stopped_has_not_taken_is_left(
+    start: Start, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    backend = PoseGraphBackend()
+    add, started, release = backend.add_odometry, threading.Event(), threading.Event()
+
+    def wait(*given: object) -> Answer:
+        started.set()
+        assert release.wait(PATIENCE)
+        return add(*given)
+
+    monkeypatch.setattr(backend, 'add_odometry', wait)
+    worker = start(backend)
+    with worker._condition:     # so that one batch has them
+        for step in range(1, 11):
+            worker.post('odom', sample(step))
+    assert started.wait(PATIENCE)
+    worker.post('odom', sample(11))     # for the next batch
+    assert not worker.stop(0.0)
+    release.set()
+    assert worker.stop(PATIENCE)
+    assert backend.estimate() is None
+    left, rest = worker.rest()
+    assert left is backend
+    assert [each.stamp_ns for _, each in rest] == [sample(step).stamp_ns for step in range(2, 12)]
+
+
 def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker(start: Start) -> None:
     def fail(stopped: Callable[[], bool]) -> None:
         raise OSError('no space')

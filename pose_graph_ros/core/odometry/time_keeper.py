@@ -5,11 +5,13 @@ The one judge of stamps: the time of the robot is that of its odometry.
 
 A stamp is of the present if it is near the newest one, and stamps of another time are believed
 only if several consecutive ones agree with one another for a second, while no other odometry goes
-on. Time has moved on then (a silence has ended), or begins again (a bag that is played in a loop,
-a simulation that is reset). Only messages that are usable otherwise are shown to it.
+on. Time has moved on then (a silence has ended), or begins again (a bag that is played again, a
+robot that is started again): that is believed only if who knows the senders finds it possible, as
+a graph ends with it. Only messages that are usable otherwise are shown to it.
 """
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,6 +63,8 @@ class TimeKeeper:
 
     def __init__(self, odometry: list[str], threshold_ns: StampNs) -> None:
         self.threshold_ns = threshold_ns
+        # tells whether time may begin again with a source; a recording cannot tell
+        self.may_begin_again: Callable[[str], bool] = lambda _: True
         self._odometry = list(odometry)
         self._watches = defaultdict[str, _Watch](_Watch)
         self._since_ns = 0
@@ -130,14 +134,16 @@ class TimeKeeper:
         # time does not move with the source if it went on elsewhere meanwhile
         if is_evidence and not decides and 2 * (others_ns - watch.others_ns) > lasts_ns:
             watch.newest_ns = 0
-        if is_evidence and (decides or watch.newest_ns > 0):
-            begins_again = stamp_ns < earliest_ns
+        begins_again, can_decide = stamp_ns < earliest_ns, decides or watch.newest_ns > 0
+        watch.in_doubt = begins_again and can_decide and self.may_begin_again(source)
+        if begins_again and can_decide and not watch.in_doubt:
+            return Judgement(self._refusal(source, stamp_ns))
+        if is_evidence and can_decide:
             if decides or begins_again:
                 self._watches.clear()
                 self._watches[source], self._since_ns = watch, watch.first_ns
             watch.set_present(stamp_ns)
             return Judgement(jump_ns=now_ns - watch.first_ns) if begins_again else PRESENT
-        watch.in_doubt = stamp_ns < earliest_ns and (decides or watch.newest_ns > 0)
         if abs(stamp_ns - max(now_ns, watch.passed_ns)) > APART_NS:
             return Judgement(self._refusal(source, stamp_ns))
         watch.passed_ns = max(watch.passed_ns, stamp_ns)
@@ -159,8 +165,11 @@ class TimeKeeper:
     def _refusal(self, source: str, stamp_ns: int) -> Answer:
         other, clock_ns = self.clock
         apart = 1e-9 * (stamp_ns - (clock_ns or self._watches[source].newest_ns))
+        is_own = other in ('', source)
         return rejected('stamp_leap', (
             f'{1e-9 * stamp_ns:.3f} s is {abs(apart):.1f} s '
             f'{"ahead of" if apart > 0 else "behind"} '
-            f'{"those before" if other in ("", source) else f"the stamps of {other}"}: mend the '
-            f'clock of its driver, or set {source}.time_offset'))
+            f'{"those before" if is_own else f"the stamps of {other}"}: ' + (
+                'if a new drive or loop of a bag is meant, call ~/reset, or play with --clock and '
+                'use_sim_time; else ' if is_own and apart < 0 else '')
+            + f'mend the clock of its driver, or set {source}.time_offset'))

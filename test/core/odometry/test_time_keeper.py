@@ -60,6 +60,18 @@ def test_time_begins_again_once_stamps_behind_go_on_for_a_second(away: float) ->
     assert one.answers(*(stamps[-1] + 0.1 * step for step in range(50))) == {'used'}
 
 
+@pytest.mark.parametrize('away', [-2.0, -3600.0])
+def test_time_does_not_begin_again_where_it_may_not(away: float) -> None:
+    one, asked = Given(), []
+    one.keeper.may_begin_again = lambda source: asked.append(source) or len(asked) > 50
+    stamps = [NOW + away + 0.1 * step for step in range(100)]
+    assert one.answers(*stamps[:5]) == {'refused'}
+    assert one.goes_on()
+    assert set(asked) == {'odom'}
+    # until it may
+    assert [one.send(each) for each in stamps] == 45 * ['refused'] + ['again'] + 54 * ['used']
+
+
 def test_after_a_long_silence_time_goes_on_once_stamps_agree_for_a_second() -> None:
     one, stamps = Given(), [NOW + 3600.0 + 0.1 * step for step in range(40)]
     assert [one.send(each) for each in stamps] == 10 * ['refused'] + 30 * ['used']
