@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import odometry_at, START
+from circle import odometry_at, START, true_pose
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import (
@@ -258,7 +258,7 @@ def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
 
 
 def test_a_graph_that_was_replaced_comes_back_with_all_that_was_posted_to_it(
-    active: Robot,
+    active: Robot, caplog: pytest.LogCaptureFixture,
 ) -> None:
     active.drive(4.0)
     session, plane = active.session, active.session.input.reader.datum.plane
@@ -279,8 +279,13 @@ def test_a_graph_that_was_replaced_comes_back_with_all_that_was_posted_to_it(
     active.wait(lambda: session.worker.status.counts['odom', 'accepted'] == 60, 'all are in it')
     assert session.worker._backend is first._backend
     assert session.input.reader.datum.plane is plane
-    active.drive(8.0, begin=6.0)
+    # the robot has driven on meanwhile
+    active.drive(24.0, begin=20.0)
     assert 'odom.jump' not in active.values()
+    final = session.optimize()
+    active.wait(final.done, 'it is optimised')
+    newest = session.worker.estimate
+    np.testing.assert_allclose(newest.T_map_base[:2], true_pose(23.9)[:2], atol=1e-3)
     # the other graph is the one that can be brought back now, and no empty one takes its place
     assert session.replaced.worker is loaded
     undo()
@@ -289,7 +294,9 @@ def test_a_graph_that_was_replaced_comes_back_with_all_that_was_posted_to_it(
     session.reset()
     session.reset()
     assert session.replaced.worker is newest
-    assert active.values()['undo'] == f'{len(saved.nodes.ids)} hidden nodes, by ~/undo_reset'
+    left = f'{len(saved.nodes.ids)} hidden nodes, by ~/undo_reset'
+    assert active.values()['undo'] == left
+    assert f'a call of ~/reset; what can be brought back: {left}' in caplog.text
 
 
 @pytest.mark.parametrize('robot', [{
