@@ -88,6 +88,7 @@ def test_the_graph_before_a_new_beginning_is_brought_back_and_goes_on(
 
 def test_two_resets_are_undone_once(client: Client) -> None:
     drive(client, 4.0)
+    client.optimize()
     nodes = client.values['hidden_nodes']
     for _ in range(2):
         assert f'{nodes} hidden nodes, by ~/undo_reset' in client.trigger('reset').message
