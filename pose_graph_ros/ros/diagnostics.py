@@ -175,13 +175,13 @@ def concerns(session: 'Session') -> Iterator[Concern]:
     estimate, report = worker.estimate, worker.status.report
     if not worker.thread.is_alive():
         yield Concern(ERROR, 'the worker thread has ended: restart the node')
-    if (what := worker.watchdog.interrupted) != '':
-        yield Concern(WARN, f'{what} took longer than solve_timeout and was interrupted; the '
-                      'poses follow odometry. Call ~/optimize with a larger solve_timeout')
     if report is not None and report.status is Status.FAILED and report.reason != INTERRUPTED:
         yield Concern(ERROR, 'the solver failed with ' + (
             ', '.join(worker.status.set_aside) or 'the newest measurements') + ': set aside until '
             '~/optimize; the estimate is without them. See the log for the reason')
+    if (what := worker.watchdog.interrupted) != '':
+        yield Concern(WARN, f'{what} took longer than solve_timeout and was interrupted; the '
+                      'poses follow odometry. Call ~/optimize with a larger solve_timeout')
     if not session.active:
         yield Concern(GOOD, 'inactive: activate the node (ros2 lifecycle set)')
     if received.paused:

@@ -27,12 +27,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
-from pose_graph_ros.core.exceptions import (
-    ConfigError,
-    FileFormatError,
-    INTERRUPTED,
-    PoseGraphError,
-)
+from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
 from pose_graph_ros.core.geometry import covariance, geodesy, se2
 from pose_graph_ros.core.io import graph_files
 from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph
@@ -283,7 +278,7 @@ class Worker:
             seconds = time.monotonic() - start
             count, total, longest = self.durations
             self.durations = count + 1, total + seconds, max(longest, seconds)
-        if report.reason not in ('', INTERRUPTED):
+        if report.reason != '' and not self._backend.graph.memory.interrupted:
             logger.warning('the solver failed with what is set aside, the estimate is without it: '
                            '%s', report.reason)
         return report

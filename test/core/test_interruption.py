@@ -159,13 +159,13 @@ def test_what_takes_too_long_alone_is_set_aside_until_a_full_optimisation() -> N
 def test_an_optimisation_that_is_interrupted_at_any_time_leaves_the_path_and_the_queue(
     after: float,
 ) -> None:
-    backend, true = drive(300)
-    measure(backend, true, 0, 250)
+    backend, true = drive(200)
+    measure(backend, true, 0, 170)
     backend.optimize()
     path = backend.estimate().path.poses
     # far off, but a person says that it is right
     backend.add_measurement(LoopClosure(
-        280 * SECOND, np.array([5.0, 5.0, 1.0]), 0.01 * np.eye(3), reference_ns=80 * SECOND),
+        180 * SECOND, np.array([5.0, 5.0, 1.0]), 0.01 * np.eye(3), reference_ns=80 * SECOND),
         'loop_closure')
     backend.update()
     before = backend.estimate().path.poses
