@@ -92,6 +92,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               0.01, 60.0),
     Parameter('closing_silence', 2.0, 's', 'Time without any message after which the whole graph '
               'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
+    Parameter('solve_timeout', 10.0, 's', 'Time after which an update, an optimisation or other '
+              'work on the graph is interrupted and undone. Measurements of an update are tried '
+              'again in smaller groups, for longer. If 0, there is no limit.', 0.0, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
     Early('load_graph_on_start', False, '', 'Whether to continue with the graph in `graph_file`, '

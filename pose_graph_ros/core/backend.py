@@ -54,6 +54,7 @@ class PoseGraphBackend:
                  smoother: IncrementalSmoother | None = None) -> None:
         self._config = config or BackendConfig()
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
+        self.interrupt = self._smoother.interrupt
         self.graph = self._smoother.graph  # which only this object may change
         self._nodes = hidden_nodes.HiddenNodes(self._config, self._make_node)
         self.odometry = self._nodes.streams  # by source, to be read only
@@ -83,6 +84,9 @@ class PoseGraphBackend:
         self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
         self._waits = False  # whether the queue waits until the graph is solved
+        # most constraints that the next update adds; and the number of updates that were
+        # interrupted since one has added all that waits
+        self._most, self.n_interrupted = 2**62, 0
 
     def configure(self, config: BackendConfig) -> None:
         """Change the settings for later input; raises as `BackendConfig.changed_to` does."""
@@ -249,11 +253,22 @@ class PoseGraphBackend:
         Add all new constraints to the graph and update the estimate; to be called by a timer.
 
         The work depends on how much the new constraints change, not on the size of the graph.
-        Constraints that make it fail are set aside and named by the report.
+        Constraints that make it fail are set aside and named by the report. After an interruption
+        one is tried alone, and set aside if that takes too long again; then two, and so on.
         """
+        pipeline, most = self._pipeline, self._most
+        pipeline.queue, rest = pipeline.queue[:most], pipeline.queue[most:]
         report, untried = self._update()
-        self._pipeline.queue = untried + self._pipeline.queue
+        pipeline.queue = untried + pipeline.queue + rest
         self._forgetting.step(self._config)
+        if self.graph.memory.interrupted:
+            if most == len(untried) == 1:
+                self._quarantine.append(pipeline.queue.pop(0))
+            self._most, self.n_interrupted = 1, self.n_interrupted + 1
+        elif len(rest) == 0:
+            self._most, self.n_interrupted = 2**62, 0
+        else:
+            self._most = 2 * most
         return report
 
     def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, list[Queued]]:
@@ -321,10 +336,6 @@ class PoseGraphBackend:
             self._evaluate()
         return result
 
-    def interrupt_refinement(self) -> None:
-        """Let the running or the next `refine` end early, without effect; any thread may call."""
-        self._smoother.interrupt()
-
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
         # the only part of an update that is linear in the graph: 0.03 ms per 1000 nodes
@@ -364,10 +375,11 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return report
         self._forgetting.step(self._config)
-        self._tuner.decide()
-        self._settle()
         optimized = UpdateReport(Status.FAILED, chi2=self._chi2)
         with tr.Transaction() as transaction:
+            self.graph.memory.check()
+            self._tuner.decide()
+            self._settle()
             self._judge.finish(transaction)
             self._settle()  # what is believed again
             optimized = self._optimize_whole()

@@ -194,7 +194,7 @@ def _strains(graph: Graph, parts: Parts, sources: Mapping[str, _Part]) -> dict[s
 
 def _solved_without(graph: Graph, parts: Mapping[str, _Part], source: str) -> Graph | None:
     """Return a copy that is solved without a source; None if that fails."""
-    copy, part = Graph(), parts[source]
+    copy, part = Graph(graph), parts[source]
     copy.fill(graph.rows())
     kinds = {each.kind for name, each in parts.items() if name != source}
     # what nothing else holds is held where the first node is

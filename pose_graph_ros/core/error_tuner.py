@@ -156,7 +156,8 @@ class ErrorTuner:
         if np.count_nonzero(fixes.bank.rows['decides']) < BANK.first_learnt:
             return
         # what was in use depends on the order of arrival
-        found = to_the_end(learning.search(fixes.bank, fixes.known()))
+        memory = self._smoother.graph.memory
+        found = to_the_end(learning.search(fixes.bank, fixes.known()), memory.check)
         self._use(found, found.best)
         self.finish_change()
 

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exceptions of the engine; all derive from `PoseGraphError`."""
 
+# Reason of all that fails as another thread wants it to end.
+INTERRUPTED = 'it took too long'
+
 
 class PoseGraphError(Exception):
     """Base class of all exceptions of this package."""

@@ -82,14 +82,19 @@ class Forgetting:
 
     def step(self, config: BackendConfig) -> None:
         """Let the nodes leave that are due, by the window and by thinning."""
-        if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
+        if len(self._parts.nodes) == 0 or self._parts.graph.has_touched or (
+                self._parts.graph.memory.interrupted):
             return
         nodes, window = self._parts.nodes, config.window
         n = n_leaving(window, nodes) if max(window.nodes, window.seconds, window.metres) > 0 else 0
         if n > 0:
             n = n_leaving(window, nodes, self._parts.pipeline.needed_ns)
         if n > 0 and len(nodes) >= self._rest:
-            self._freeze(n, window.prior)
+            try:
+                self._freeze(n, window.prior)
+            except exceptions.GraphUpdateError:
+                self._parts.pipeline.counts['solver', 'failed'] += 1
+                self._rest = len(nodes) + sr.LIMITS.rest
         self._step_of_thinning(config.thinning)
 
     def restored(self) -> None:
@@ -229,12 +234,7 @@ class Forgetting:
         gone = None if prior is WindowPrior.DENSE else self._solve(
             sr.sparse_marginalization(graph, leaving))
         if gone is None:
-            try:
-                gone = parts.smoother.forget(leaving)
-            except exceptions.GraphUpdateError:
-                parts.pipeline.counts['solver', 'failed'] += 1
-                self._rest = len(nodes) + sr.LIMITS.rest
-                return
+            gone = parts.smoother.forget(leaving)
         self._tell(gone, judged, places)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:

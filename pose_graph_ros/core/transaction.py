@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import queued
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.exceptions import INTERRUPTED, LinearSolveError
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
@@ -74,10 +74,11 @@ def update_isolated(add_queue: Update, parts: Parts) -> tuple[UpdateReport, list
     """
     Return the report of an update, and the constraints that were not tried in it.
 
-    If it sets constraints aside, it has the status FAILED, and the reason names them.
+    If it sets constraints aside, it has the status FAILED, and the reason names them. None of them
+    is to blame for an interruption.
     """
     (report, failed), pipeline = add_queue(), parts.pipeline
-    if report.status is not Status.FAILED:
+    if report.status is not Status.FAILED or report.reason == INTERRUPTED:
         return report, failed
     pipeline.counts['solver', 'failed'] += 1
     if len(failed) == 0 or (len(failed) > 1 and not succeeds(parts.smoother, GraphUpdate())):
@@ -110,11 +111,12 @@ def update_with_all(update: Update, parts: Parts) -> UpdateReport:
     Return one report of updates with all constraints in the queue, then with those set aside.
     """
     (report, untried), pipeline, quarantine = update(), parts.pipeline, parts.quarantine
-    while len(untried) > 0:     # each update sets at least one aside
+    while len(untried) > 0 and report.reason != INTERRUPTED:    # each update sets one aside
         pipeline.queue = untried + pipeline.queue
         again, untried = update()
         report = report.before(again)
-    if len(quarantine) > 0:
+    pipeline.queue = untried + pipeline.queue
+    if len(quarantine) > 0 and report.reason != INTERRUPTED:
         pipeline.queue += quarantine
         quarantine.clear()
         again, untried = update()
@@ -137,10 +139,10 @@ def isolate(
     bad, untried, suspects, attempts = [], list[Queued](), failed, 0
     why: str | None = reason    # '' if one of them has to be bad, None if nothing is known of them
     while True:
-        if why and len(suspects) == 1:
+        if why and why != INTERRUPTED and len(suspects) == 1:
             bad.append((suspects, why))
             suspects, untried, why = untried, [], None
-        if len(suspects) == 0 or attempts == MOST_ATTEMPTS:
+        if len(suspects) == 0 or attempts == MOST_ATTEMPTS or why == INTERRUPTED:
             return bad, suspects + untried
         # one alone is suspected because all others were added
         whole = why is None or len(suspects) == 1

@@ -24,6 +24,7 @@ from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
 from pose_graph_ros.core import alignment, disagreement
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.exceptions import INTERRUPTED
 from pose_graph_ros.core.judgement.texts import short, total_values
 from pose_graph_ros.core.odometry import motion
 from pose_graph_ros.core.sources import gyro, settings
@@ -47,7 +48,8 @@ def values(session: 'Session') -> dict[str, object]:
         'prepared': int(worker.prepared), 'active': int(session.active),
         'paused': int(session.input.paused), 'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * total / max(updates, 1):.3f}',
-        'solve_max_ms': f'{1e3 * longest:.3f}', 'memory_mb': f'{memory() / 1e6:.0f}'}
+        'solve_max_ms': f'{1e3 * longest:.3f}', 'worker.timed_out': worker.watchdog.count,
+        'memory_mb': f'{memory() / 1e6:.0f}'}
     if (journal := session.journal) is not None:
         found |= {'journal.lag_max_s': f'{journal.lag:.3f}',
                   'journal.size_mb': f'{journal.size / 1e6:.3f}',
@@ -179,13 +181,16 @@ def concerns(session: 'Session') -> Iterator[Concern]:
     estimate, report = worker.estimate, worker.status.report
     if not worker.thread.is_alive():
         yield Concern(ERROR, 'the worker thread has ended: restart the node')
-    if report is not None and report.status is Status.FAILED:
+    if report is not None and report.status is Status.FAILED and report.reason != INTERRUPTED:
         yield Concern(ERROR, 'the solver failed with ' + (
             ', '.join(worker.status.set_aside) or 'the newest measurements') + ': set aside until '
             '~/optimize; the estimate is without them. See the log for the reason')
     if session.journal is not None and session.journal.failure != '':
         yield Concern(ERROR, f'the journal cannot be written, and what comes would be lost with '
                       f'this process: {session.journal.failure}')
+    if (what := worker.watchdog.interrupted) != '':
+        yield Concern(WARN, f'{what} took longer than solve_timeout and was interrupted; the '
+                      'poses follow odometry. Call ~/optimize with a larger solve_timeout')
     if not session.active:
         yield Concern(GOOD, 'inactive: activate the node (ros2 lifecycle set)')
     if received.paused:

@@ -94,6 +94,8 @@ class Session:
         if datum is not None:
             self.input.reader.datum.keep(datum)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
+        self._set_timer('watchdog', 0.2, lambda: self.worker.watchdog.watch(
+            self.values['solve_timeout']))
 
     def _begin(self, backend: PoseGraphBackend, prepare: Callable[[Callable[[], bool]], Any], *,
                resumes: bool) -> None:
@@ -170,7 +172,8 @@ class Session:
         """Stop the worker; destroy subscriptions, timers and publishers."""
         if self.active:
             self.deactivate()
-        self.node.destroy_timer(self._timers.pop('diagnostics'))
+        for name in ('diagnostics', 'watchdog'):
+            self.node.destroy_timer(self._timers.pop(name))
         if self.journal is not None:
             with suppress(CancelledError, TimeoutError):
                 self._keep_state().result(STOP_TIMEOUT)

@@ -34,6 +34,7 @@ from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import ANSWER, verdict_lines
+from pose_graph_ros.ros.watchdog import Watchdog
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +91,7 @@ class Worker:
         self._update_wanted = False
         self._jobs: list[tuple[str, Job[object], Future[object]]] = []
         self._stopping = False
+        self.watchdog = Watchdog()
         self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
         self._condition = threading.Condition()
         self._revision = backend.revision
@@ -105,7 +107,7 @@ class Worker:
         """Make the thread end, wait for it at most a time [s], and return whether it has ended."""
         with self._condition:
             self._stopping = True
-            self._backend.interrupt_refinement()
+            self._backend.interrupt()
             self._condition.notify()
         self.thread.join(timeout)
         return not self.thread.is_alive()
@@ -131,7 +133,7 @@ class Worker:
         """Request an update of the graph with all posted measurements."""
         with self._condition:
             self._update_wanted = True
-            self._backend.interrupt_refinement()
+            self._backend.interrupt()
             self._condition.notify()
 
     def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
@@ -146,7 +148,7 @@ class Worker:
                 future.cancel()
             else:
                 self._jobs.append((what, job, future))  # type: ignore[arg-type]
-                self._backend.interrupt_refinement()
+                self._backend.interrupt()
                 self._condition.notify()
         return future
 
@@ -236,9 +238,11 @@ class Worker:
         self.is_optimal = self.is_optimal and not wanted
         if self.chapter is not None:
             self.chapter.taken += len(batch)
+        report = None
         if wanted:
             self._note('update')
-        report = self._update(self._backend.update) if wanted else None
+            with self.watchdog.over(self._backend, 'an update'):
+                report = self._update(self._backend.update)
         # after a jump of the odometry the old estimate cannot be propagated
         stale = self._revision != self._backend.revision
         if report is not None or self.estimate is None or stale:
@@ -248,7 +252,8 @@ class Worker:
 
     def _refine(self) -> None:
         """Refine a little, while there is nothing else to do; publish moves that can be seen."""
-        result = self._backend.refine()
+        with self.watchdog.over(self._backend, 'a refinement'):
+            result = self._backend.refine()
         self._may_refine = not result.finished
         self._refined += result.moved
         # it judges again, too; and a move that can be seen [m]
@@ -262,7 +267,9 @@ class Worker:
         if not future.set_running_or_notify_cancel():
             return
         try:
-            future.set_result(job(self._backend))
+            with self.watchdog.over(self._backend, what):
+                result = job(self._backend)
+            future.set_result(result)
         except Exception as error:
             self._count_failure(what, error)
             future.set_exception(error)
@@ -310,7 +317,7 @@ class Worker:
             seconds = time.monotonic() - start
             count, total, longest = self.durations
             self.durations = count + 1, total + seconds, max(longest, seconds)
-        if report.reason != '':
+        if report.reason != '' and not self._backend.graph.memory.interrupted:
             logger.warning('the solver failed with what is set aside, the estimate is without it: '
                            '%s', report.reason)
         return report

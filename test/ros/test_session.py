@@ -188,7 +188,8 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     final = session.optimize()
     active.wait(final.done, 'it is optimised')
     worker = Space(thread=session.worker.thread, prepared=True, is_optimal=False,
-                   status=session.worker.status, estimate=session.worker.estimate)
+                   status=session.worker.status, estimate=session.worker.estimate,
+                   watchdog=Space(interrupted=''))
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
                      arrivals={'fix': Space(wrong='')}, reader=Space(sources={}))
     seen = Space(worker=worker, active=True, journal=None, input=received,
@@ -223,6 +224,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
             (worker, {'prepared': False}, WARN, 'Loading compiled kernels'),
             (seen, {'compiling': True}, WARN, 'measurements wait'),
             (seen, {'active': False}, OK, 'Inactive'),
+            (worker.watchdog, {'interrupted': 'an update'}, WARN, 'An update took longer'),
             (worker, lambda: status(report=UpdateReport(Status.FAILED, 'singular', 0, 0, 0.0)),
              ERROR, 'solver failed'),
             (worker, {'thread': Space(is_alive=lambda: False)}, ERROR, 'restart')):

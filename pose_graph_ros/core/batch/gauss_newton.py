@@ -39,7 +39,7 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
 
     `terms` says what constraints add; see `assembly`. For LINEARIZED the poses become the
     references, and all factors are linearized there. Return False if a node is not determined,
-    which is `BAD_NODE` of the head.
+    which is `BAD_NODE` of the head, or if it is interrupted.
     """
     scalars = tb.scalars(head)[0]
     if terms == assembly.LINEARIZED:
@@ -50,9 +50,10 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
         bad = assembly.eliminate_clique(head, c, terms)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
+        if bad >= 0 or tb.interrupt(head)[tb.ALL] != 0:
             break
     scalars.damping = 0.0
-    return bad < 0
+    return bad < 0 and tb.interrupt(head)[tb.ALL] == 0
 
 
 @kernel(forceinline=True)

@@ -15,7 +15,7 @@ reduces lambda, which is set to 0 when it is small and after some damped steps.
 Nothing in here is compiled; a `System` does the linear algebra.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -121,11 +121,13 @@ Optimization = Generator[None, None, BatchResult]
 """An optimisation that pauses after parts of at most an iteration; it returns the result."""
 
 
-def to_the_end(parts: Generator[None, None, Result]) -> Result:
-    """Return the result of what is done in parts after doing all of them."""
-    while True:
+def to_the_end(parts: Generator[None, None, Result],
+               between: Callable[[], None] = lambda: None) -> Result:
+    """Return the result of what is done in parts, each of which is followed by a call."""
+    while True:     # whoever makes the parts counts them
         try:
             next(parts)
+            between()
         except StopIteration as end:
             result: Result = end.value
             return result

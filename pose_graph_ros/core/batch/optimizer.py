@@ -28,7 +28,7 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
 )
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
-from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.exceptions import INTERRUPTED, LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
@@ -63,6 +63,8 @@ def in_parts(graph: Graph, config: SolverConfig,
              starts: Sequence[Start] = (Start.PRESENT,)) -> Optimization:
     """Return the result of `optimize`, after a pause at each iteration."""
     chi2 = chi2_of(graph)
+    if graph.memory.interrupted:
+        return _failed(INTERRUPTED, chi2)
     if not np.isfinite(chi2):
         return _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
@@ -160,6 +162,7 @@ def _is_observed(graph: Graph) -> bool:
 
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
+    graph.memory.check()
     if start is Start.CHORDAL:
         return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
     if start is Start.PRESENT:
@@ -190,7 +193,8 @@ def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     result = yield from minimize(gauss_newton.CompiledSystem(graph.memory), chi2, config)
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
-        return _failed(f'hidden node {node} is not determined', chi2)
+        return _failed(INTERRUPTED if graph.memory.interrupted else
+                       f'hidden node {node} is not determined', chi2)
     editing.settle(graph.memory.head)
     return result
 

@@ -44,6 +44,9 @@ SLOW_TAUS = 10.0, 60.0
 UNLEARNT = -1.0, -1.0, math.log2(40.0)
 LARGER = 1.0, 2.5  # by which slow errors are tried that are larger than the best ones
 MOST_ROUNDS = 2  # of learning from what is believed
+# Sweeps over all axes of one descent, which takes a few dozens: where the posterior is so flat
+# that each lowers it a little, the point that it has reached is as good.
+MOST_SWEEPS = 500
 # Positions are not correlated with headings: how they are is of a place that the robot leaves.
 APART = np.array(((1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 UNDECIDED = 5.0  # what is less likely by so many nats may be the best with all hypotheses
@@ -225,7 +228,9 @@ def descend(posterior: Posterior, begins: Sequence[Point],
     for point in begins:
         values.append(Minimum((yield from posterior.value(point)), point))
     best, step = min(values), COARSEST
-    while step >= posterior.finest:
+    for _ in range(MOST_SWEEPS):
+        if step < posterior.finest:
+            break
         before = best
         for axis in axes:
             for move in (step, -step):

@@ -47,8 +47,9 @@ class Graph:
     for `poses`. What asks for an id that is not in the graph raises ValueError, but for `.._rows`.
     """
 
-    def __init__(self) -> None:
-        self.memory = tb.Memory()
+    def __init__(self, original: 'Graph | None' = None) -> None:
+        """Begin with an empty graph; one for a copy of another one is interrupted with that."""
+        self.memory: tb.Memory = tb.Memory(None if original is None else original.memory)
         self.n_moves = 0    # how often `set_poses` or new measurements have moved the nodes
         self._updating = False
 

@@ -29,6 +29,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import INTEGERS
 from pose_graph_ros.core.compiled.numba_internals import populate_array
+from pose_graph_ros.core.exceptions import INTERRUPTED, LinearSolveError
 from pose_graph_ros.core.graph.constraints import RECORD
 
 # Types of the head and of records of `Factors`, in signatures of kernels.
@@ -148,13 +149,16 @@ SCALARS: Final = np.dtype([
 #   touched: nodes to eliminate again in the next iteration
 #   freed: pairs (clique, index in pool_f) to release on commit; index -1: the whole clique
 #   waiting: factors to relinearize
+#   interrupt: 1 if another thread wants the running kernel to end, for REFINEMENT and for ALL; a
+#       graph and the copies that are solved for it have the same
 TABLES: Final[dict[str, np.dtype[Any]]] = {
     'nodes': NODE, 'factors': FACTOR, 'cliques': CLIQUE, 'scalars': SCALARS,
     **{name: np.dtype(kind) for kind, names in (
-        ('f8', ('pool_f', 'work_f')), ('i8', ('log',)),
+        ('f8', ('pool_f', 'work_f')), ('i8', ('log', 'interrupt')),
         ('i4', ('pool_i', 'work_i', 'touched', 'freed', 'waiting', 'node_id', 'factor_id')),
     ) for name in names}}
 NAMES: Final = tuple(TABLES)
+REFINEMENT, ALL = range(2)
 WORD: Final = 8     # bytes; the size of a record is a multiple of it
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
@@ -179,7 +183,7 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 #   REFINED: first ITERATION after the last refinement; cliques BUILT before it are at the optimum
 #   LISTED: UPDATE that has listed all that the next iteration of a refinement linearizes again
 #   ROUND: number of iterations of the refinement so far
-#   INTERRUPT: set to 1 by another thread to end a refinement
+#   HEEDS: whose `interrupt` ends the running kernel, beside that for ALL
 #   NEXT_NODE, NEXT_FACTOR: ids of the next new rows
 #   N_LEAVING: number of rows that `editing.compact` takes out after the update, without those that
 #       leave because of the node that they are on
@@ -189,7 +193,7 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
  N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END, UPDATE,
  ITERATION, FRONT_SERIAL, NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
  N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
- REFINED, LISTED, ROUND, INTERRUPT, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 40)
+ REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 40)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -236,8 +240,8 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
     return made
 
 
-(nodes, factors, cliques, scalars, pool_f, work_f, log, pool_i, work_i, touched, freed, waiting,
- node_id, factor_id) = map(_array, NAMES)
+(nodes, factors, cliques, scalars, pool_f, work_f, log, interrupt, pool_i, work_i, touched, freed,
+ waiting, node_id, factor_id) = map(_array, NAMES)
 # the same memory as numbers of eight bytes
 node_words, factor_words, clique_words, scalar_words = (
     _array(name, types.int64) for name in NAMES[:4])
@@ -266,18 +270,31 @@ def as_bytes(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 class Memory:
-    """Owns the tables and the head of one graph."""
+    """Owns the tables and the head of one graph, which is interrupted with that of another."""
 
-    def __init__(self) -> None:
+    def __init__(self, another: 'Memory | None' = None) -> None:
         self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
         self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:
-            self.ensure(name, 1 if name == 'scalars' else {
+            self.ensure(name, {'scalars': 1, 'interrupt': 2}.get(name) or {
                 'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
         self.ensure('work_f', 256)  # for `chain` and `step`; fronts ask for more
         self.ensure('log', 64)  # for `transaction_log.begin` of an empty graph
+        if another is not None:
+            self._tables['interrupt'] = another['interrupt']
+            self.head[2 * NAMES.index('interrupt')] = another['interrupt'].ctypes.data
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether another thread wants all to end that is done with the graph."""
+        return bool(self['interrupt'][ALL])
+
+    def check(self) -> None:
+        """Raise LinearSolveError if it is interrupted."""
+        if self.interrupted:
+            raise LinearSolveError(INTERRUPTED)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """Return a table with all its capacity; invalid after the next `ensure`."""

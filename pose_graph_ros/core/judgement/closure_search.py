@@ -226,7 +226,7 @@ def decide(graph: Graph, ids: IntArray, forced: IntArray, inside: BoolArray,
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:
     """Return a copy of a graph in which closures, by id, have the information to decide by."""
-    rows, copy, at = graph.rows(), Graph(), graph.factor_rows(closures)
+    rows, copy, at = graph.rows(), Graph(graph), graph.factor_rows(closures)
     factors = rows.factors.replaced()
     factors.records[at] = floored(forward(factors.rows(at))).records
     copy.fill(rows._replace(factors=factors))

@@ -100,7 +100,7 @@ class FixJudge:
             node = int(rows['node'][np.argmin(rows['stamp_ns'])])
             self.bank.begin_with(node, graph.poses_of(node), self._smoother.covariance(node))
         self._insert(rows)
-        decided = self.bank.decide()
+        decided = self._decide()
         self._apply(self.bank.told(0) if self._is_new or len(self.bank) <= FEW else decided)
         # how far the new ones are from where they were expected
         for row_id, d2 in zip(self.bank.rows['id'][decided.first:].tolist(), decided.d2.tolist(),
@@ -219,6 +219,12 @@ class FixJudge:
             self.bank, self.next_bank, self._is_new = self.next_bank, None, True
         return self.next_bank is not None
 
+    def _decide(self) -> Decided:
+        """Take the bank to the newest row; what it has passed stays if that is interrupted."""
+        while self.bank.advance(ROWS_IN_STEP):
+            self._smoother.graph.memory.check()
+        return self.bank.decide()
+
     def _apply(self, decided: Decided) -> None:
         """Believe and doubt measurements, and odometry where it has slipped."""
         states, rows = self.states, self.bank.rows[decided.first:]
@@ -325,10 +331,10 @@ class FixJudge:
         if len(self.bank) == 0 or self._smoother.graph.has_touched:
             return
         while self.step():
-            pass
+            self._smoother.graph.memory.check()
+        self._decide()
         self._begin()
         self._slips, self.loosened = {}, {}
-        self.bank.decide()
         self._apply(self.bank.told(0))
         change = self._with_weights(GraphUpdate())
         if len(change.weigh) > 0 and self._smoother.update(change).reason != '':

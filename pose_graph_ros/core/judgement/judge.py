@@ -251,7 +251,7 @@ class Judge:
             judge.keep(undo)
         # each part believes one more, or leaves fewer to be tested
         while self._closures.test():
-            pass
+            graph.memory.check()
         self.fixes.finish()
         self._follow_odometry(self._nodes.newest_ns)
         self._closures.decide_finally()

@@ -25,6 +25,7 @@ from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import backward_rows
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import separator, triangle_size
+from pose_graph_ros.core.smoother.tree_update import interrupted
 
 # Energy of a constraint that is assumed to predict its linearization error from a turn [sigma^2].
 USUAL_ENERGY = 0.1
@@ -236,7 +237,7 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
     head[tb.N_TURNED] = head[tb.N_CHECKS] = head[tb.N_CHANGED] = 0
     scalars.n_moved = 0.0
     while depth > 0:
-        if refines and head[tb.INTERRUPT] != 0:
+        if interrupted(head):
             break   # the caller rolls back
         depth -= 1
         c = stack[depth]

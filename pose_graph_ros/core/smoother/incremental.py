@@ -10,7 +10,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.config import SmootherConfig
-from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.exceptions import GraphUpdateError, INTERRUPTED
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import tables as tb
@@ -122,16 +122,18 @@ class IncrementalSmoother:
         self._require_solved()
         if self.graph.newest_pose < 0:
             return Refinement(finished=True, moved=0.0)
-        code = self._refinement_step()
+        code = self._refinement_step(tb.REFINEMENT)
         if code in (tree_update.DONE, tree_update.UNFINISHED):
             moved = float(self._memory['scalars']['largest_move'][0])
             return Refinement(finished=code == tree_update.DONE, moved=moved)
-        self._memory.head[tb.INTERRUPT] = 0
-        return Refinement(finished=code != tree_update.INTERRUPTED, moved=0.0)
+        self.interrupt(tb.REFINEMENT, on=False)
+        return Refinement(
+            finished=code != tree_update.INTERRUPTED or self._memory.interrupted, moved=0.0)
 
-    def _refinement_step(self) -> int:
+    def _refinement_step(self, heeds: int) -> int:
         """Do an iteration in a transaction; return the code of `step.refine`."""
-        while True:
+        self._memory.head[tb.HEEDS] = heeds
+        while True:     # each time with more memory
             with self._editing():
                 code: int = step.refine(self._memory.head)
             if code in (tree_update.DONE, tree_update.UNFINISHED):
@@ -145,7 +147,7 @@ class IncrementalSmoother:
     def trial(self, update: GraphUpdate, poses: Poses | None = None) -> Trial:
         """Return a trial of new weights, on a copy; raises ValueError as `refine` does."""
         self._require_solved()
-        other = IncrementalSmoother(self._config)
+        other = IncrementalSmoother(self._config, Graph(self.graph))
         return Trial(self.graph, other.graph, update,
                      lambda: other._eliminate().status is not Status.FAILED, poses)
 
@@ -167,9 +169,14 @@ class IncrementalSmoother:
             self.graph.memory = self._memory = other.graph.memory
         return result
 
-    def interrupt(self) -> None:
-        """Let the running or the next `refine` end early, without effect; any thread may call."""
-        self._memory.head[tb.INTERRUPT] = 1
+    def interrupt(self, what: int = tb.REFINEMENT, *, on: bool = True) -> None:
+        """
+        Let the running or the next `refine` end early, without effect; any thread may call.
+
+        With `ALL` everything that runs or begins fails, at its next clique or iteration, as long
+        as that is on.
+        """
+        self._memory['interrupt'][what] = on
 
     def extend(self, mean: se2.PoseVector, information: FloatArray,
                weight: float = 1.0) -> UpdateResult:
@@ -239,7 +246,7 @@ class IncrementalSmoother:
         What `forget` makes of them keeps its linearization. Nothing happens if the linearization
         errors of the constraints of the nodes are within the budget of an update that moves them.
         Whoever wants their last estimate asks for it between the two. Returns the rows of the
-        nodes, ascending; raises as `forget` does.
+        nodes, ascending; raises as `forget` does, also if it is interrupted.
         """
         self._require_solved()
         ids, head = np.fromiter(nodes, np.int64, len(nodes)), self._memory.head
@@ -250,9 +257,9 @@ class IncrementalSmoother:
             raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
         if (rows == head[tb.NEWEST]).any():
             raise GraphUpdateError(f'forget: {self.graph.newest_pose} is the newest pose')
-        if forgetting.far_from_linear(head, rows):
-            while self._refinement_step() == tree_update.INTERRUPTED:
-                head[tb.INTERRUPT] = 0
+        if forgetting.far_from_linear(head, rows) and (
+                self._refinement_step(tb.ALL) == tree_update.INTERRUPTED):
+            raise GraphUpdateError(f'forget: {INTERRUPTED}')
         return rows
 
     def newest_covariance(self) -> se2.Covariance:
@@ -339,6 +346,9 @@ class IncrementalSmoother:
             reason = f'hidden node {node} is not determined'
             self.graph.rollback()
             return UpdateResult(Status.FAILED, reason)
+        if code == tree_update.INTERRUPTED:
+            self.graph.rollback()
+            return UpdateResult(Status.FAILED, INTERRUPTED)
         self.graph.commit()
         status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
         return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
@@ -361,11 +371,12 @@ class IncrementalSmoother:
         self.graph.rollback()
         # the start if the linear start leads to a higher chi2
         rows.poses[:self.graph.n_nodes] = self.graph.poses
-        other = IncrementalSmoother(self._config)
+        other = IncrementalSmoother(self._config, Graph(self.graph))
         if trial.optimize_copy(other.graph, rows, leaving):
             result = other._eliminate()
             if result.status is not Status.FAILED:
                 self.graph.memory = self._memory = other.graph.memory
                 return result
         return UpdateResult(
-            Status.FAILED, 'the iterations do not converge, and there is no batch solution')
+            Status.FAILED, INTERRUPTED if self._memory.interrupted else
+            'the iterations do not converge, and there is no batch solution')

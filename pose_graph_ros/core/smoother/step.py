@@ -51,6 +51,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     if entered == FIRST:
         head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
         scalars.error2_before = 0.0
+    head[tb.HEEDS] = tb.ALL
     if entered != RESUMED:
         scalars.lowest = scalars.chi2
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
@@ -67,13 +68,15 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if head[tb.STRUCTURE] != 0:
             code = tree_update.rebuild(head, marked, affected)
         else:
-            code = tree_update.refresh(head, marked, False)
+            code = tree_update.refresh(head, marked)
         if code != tree_update.DONE:
             return code
         head[tb.STRUCTURE] = 0
         forget_touched(head)
         head[tb.N_ELIMINATED] += len(affected)
         error2 = _solve_and_check(head)
+        if tree_update.interrupted(head):
+            return tree_update.INTERRUPTED
         settled = error2 <= _budget(head)
         if settled:
             _forget_waiting(head)
@@ -114,7 +117,7 @@ def _iterate(head):  # type: ignore[no-untyped-def]
         return tree_update.DONE      # many errors, each of them negligible
     marked, affected = tree_update.mark(head)
     head[tb.ITERATION] += 1
-    code = tree_update.refresh(head, marked, True)
+    code = tree_update.refresh(head, marked)
     if code != tree_update.DONE:
         return code
     forget_touched(head)
@@ -135,9 +138,8 @@ def refine(head):  # type: ignore[no-untyped-def]
     """
     Return DONE if the estimate is at the minimum, or UNFINISHED after an iteration towards it.
 
-    INTERRUPTED: `INTERRUPT` of the head was set. DIVERGED: the iteration leads away from the
-    minimum. After all but the first two the caller has to roll back what `transaction_log.begin`
-    has begun. The graph must have no touched nodes.
+    DIVERGED: the iteration leads away from the minimum. After all but the first two the caller has
+    to roll back what `transaction_log.begin` has begun. The graph must have no touched nodes.
     """
     scalars, cliques = tb.scalars(head)[0], tb.cliques(head)
     alpha, share = scalars.alpha, scalars.share
@@ -154,10 +156,10 @@ def refine(head):  # type: ignore[no-untyped-def]
         head[tb.ITERATION] += 1
         _solve_and_check(head)
         head[tb.ROUND], scalars.lowest = 0, scalars.chi2
-    if head[tb.INTERRUPT] != 0:
+    if tree_update.interrupted(head):
         return tree_update.INTERRUPTED
     code = _iterate(head) if scalars.error2_sum > ENOUGH else tree_update.DONE
-    if head[tb.INTERRUPT] != 0 and code != tree_update.MORE_MEMORY:
+    if tree_update.interrupted(head) and code != tree_update.MORE_MEMORY:
         return tree_update.INTERRUPTED
     if code == tree_update.DONE:
         _forget_waiting(head)

@@ -20,7 +20,7 @@ from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 # Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
 # step. MORE_MEMORY: the pools and the work space must grow to `NEED_F`, `NEED_I` and `NEED_WORK`
 # of the head, then the kernel be called again. BAD_PIVOT: node `BAD_NODE` of the head is not
-# determined. After the last three the caller has to roll back.
+# determined. INTERRUPTED: see `interrupted`. After the last three the caller has to roll back.
 DONE, UNFINISHED, MORE_MEMORY, BAD_PIVOT, DIVERGED, INTERRUPTED = range(6)
 # Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
 RELAXED_ZEROS = 16
@@ -122,23 +122,33 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         transaction_log.drop_clique(head, marked[k])
     head[tb.N_ROOTS] = 0
     for c in plant(head, cliques, orphans):
-        if not _eliminate(head, c):
-            return BAD_PIVOT
+        code = _eliminate(head, c)
+        if code != DONE:
+            return code
     return DONE
 
 
 @kernel
+def interrupted(head):  # type: ignore[no-untyped-def]
+    """Tell whether another thread wants that to end which runs."""
+    wanted = tb.interrupt(head)
+    return wanted[tb.ALL] != 0 or wanted[head[tb.HEEDS]] != 0
+
+
+@kernel
 def _eliminate(head, c):  # type: ignore[no-untyped-def]
-    """Eliminate a clique, and put it on the stack if it is a root; return whether it was done."""
+    """Eliminate a clique, and put it on the stack if it is a root; return a code."""
+    if interrupted(head):
+        return INTERRUPTED
     head[tb.BAD_NODE] = eliminate_clique(head, c, RELINEARIZED)
     if tb.cliques(head)[c].parent < 0:
         tb.work_i(head)[head[tb.N_ROOTS]] = c
         head[tb.N_ROOTS] += 1
-    return head[tb.BAD_NODE] < 0
+    return DONE if head[tb.BAD_NODE] < 0 else BAD_PIVOT
 
 
 @kernel(inline='always')
-def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
+def refresh(head, marked):  # type: ignore[no-untyped-def]
     """
     Eliminate the marked cliques again with the same structure.
 
@@ -159,11 +169,10 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         while begin > 0 and cliques[marked[begin - 1]].parent == marked[begin]:
             begin -= 1
         for k in range(begin, end):
-            if interruptible and head[tb.INTERRUPT] != 0:
-                return INTERRUPTED
             transaction_log.renew_values(head, marked[k])
-            if not _eliminate(head, marked[k]):
-                return BAD_PIVOT
+            code = _eliminate(head, marked[k])
+            if code != DONE:
+                return code
             cliques[marked[k]].built = head[tb.ITERATION]
         end = begin
     return DONE
