@@ -51,6 +51,7 @@ def test_the_graph_before_a_new_beginning_is_brought_back_and_goes_on(
 ) -> None:
     clock = client.node.create_publisher(Clock, '/clock', RELIABLE)
     client.spin_until(lambda: clock.get_subscription_count() > 0, 'the clock is heard')
+    client.wait_matched()
     message = Clock()
     message.clock.sec = int(START + 8.0)
     clock.publish(message)
@@ -88,7 +89,7 @@ def test_the_graph_before_a_new_beginning_is_brought_back_and_goes_on(
 
 def test_two_resets_are_undone_once(client: Client) -> None:
     drive(client, 4.0)
-    client.optimize()
+    assert client.optimize().success    # so that the estimate has all of it
     nodes = client.values['hidden_nodes']
     for _ in range(2):
         assert f'{nodes} hidden nodes, by ~/undo_reset' in client.trigger('reset').message
