@@ -399,7 +399,9 @@ def messages(options: Options) -> Section:
     """
     Flood the node, then drive.
 
-    Memory is the resident set of the node. Hidden nodes are those that malformed messages made.
+    Then is what the node took for what was still queued, and to optimise the graph. Read since are
+    the measurements that could be read since the newest reset, hidden nodes what they made. Memory
+    is the resident set of the node.
     """
     count = options.sizes[0] if options.sizes else COUNT // 100 if options.quick else COUNT
     section, found = Section('A flood, then a drive', about(messages)), flooded(count)
@@ -408,12 +410,12 @@ def messages(options: Options) -> Section:
     for topic in dict.fromkeys(topic for topic, _ in found.sent):
         table.add(topic, *(str(found.sent[topic, kind]) for kind in kinds))
     table = section.table(
-        'The node', 'messages', 'time [s]', 'a second', 'then [s]', 'measurements read', 'resets',
+        'The node', 'messages', 'time [s]', 'a second', 'then [s]', 'resets', 'read since',
         'hidden nodes', 'memory before / after / after the drive [MB]', 'lines of log',
         'largest error of the drive [m]')
     table.add(str(count), f'{found.seconds:.0f}', f'{count / found.seconds:.0f}',
               f'{found.behind:.0f}', *(
-                  found.values[name] for name in ('received', 'resets', 'hidden_nodes')),
+                  found.values[name] for name in ('resets', 'received', 'hidden_nodes')),
               ' / '.join(f'{each:.0f}' for each in found.memory), str(found.lines),
               f'{found.error:.3f}')
     section.ask(f'{count} messages: largest error of the drive after them', found.error, ' m',
