@@ -3,11 +3,11 @@
 """
 Measure the engine, beside GTSAM or alone; not installed and not needed by anything else.
 
-`engine`, `solve`, `inputs`, `robust`, `window` and `load` are the pages, each with its sections;
-`worlds`, `files`, `drives`, `recordings`, `wrong_closures` and `course` are what is measured on;
-`runs` drives `ours` and `gtsam_peer` step by step, `peer` is a program around GTSAM; `section` and
-`metrics` hold what was found, `report` writes it down, `__main__` reads the command line. `belief`
-is a program of its own.
+`engine`, `solve`, `inputs`, `robust`, `window`, `load` and `malformed` are the pages, each with
+its sections; `worlds`, `files`, `drives`, `recordings`, `wrong_closures` and `course` are what is
+measured on; `runs` drives `ours` and `gtsam_peer` step by step, `peer` is a program around GTSAM;
+`section` and `metrics` hold what was found, `report` writes it down, `__main__` reads the command
+line. `belief` is a program of its own.
 """
 
 import os

@@ -23,7 +23,7 @@ import traceback
 from benchmark import metrics, ours, report
 from benchmark.section import about, kept_with, Options, say, Section
 
-PAGES = 'engine', 'solve', 'inputs', 'robust', 'window', 'load'
+PAGES = 'engine', 'solve', 'inputs', 'robust', 'window', 'load', 'malformed'
 """Modules with a page each: its title, its sections by name, and what it is about."""
 FIRST = PAGES[0]
 
@@ -53,7 +53,8 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
                         help='cut a run of one tool after this time (default %(default)s); '
                         'ratios are then over the steps that were done')
     parser.add_argument('--size', dest='sizes', type=int, nargs='+', metavar='N',
-                        help='load: hidden nodes; window.samples: samples of odometry')
+                        help='load: hidden nodes; window.samples: samples of odometry; '
+                        'malformed: messages')
     parser.add_argument('--hours', type=float, metavar='H', help='window.day: length of drives')
     parser.add_argument('--rates', type=float, nargs='+', metavar='HZ',
                         help='load: of odometry (default %(default)s)')

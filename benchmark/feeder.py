@@ -130,8 +130,8 @@ class Feeder:
     def __init__(self, environment: Mapping[str, str]) -> None:
         for name in ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOG_DIR', 'AMENT_PREFIX_PATH'):
             os.environ[name] = environment[name]
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
+        self._context, self.domain = Context(), int(environment['ROS_DOMAIN_ID'])
+        rclpy.init(context=self._context, domain_id=self.domain)
         self._node = rclpy.create_node('feeder', context=self._context)
         self._odometry = self._node.create_publisher(Odometry, 'odom', QOS)
         self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', QOS)

@@ -59,14 +59,14 @@ class Process:
         arguments = [part for parameter in parameters for part in ('-p', parameter)]
         if len(arguments) > 0:
             arguments.insert(0, '--ros-args')
-        self._log = Path(environment['ROS_LOG_DIR']) / 'stderr'
-        with self._log.open('w', encoding='utf-8') as log:
+        self.log = Path(environment['ROS_LOG_DIR']) / 'stderr'
+        with self.log.open('w', encoding='utf-8') as log:
             self.process = subprocess.Popen(
                 [sys.executable, '-m', module, *arguments], env=environment, stderr=log)
 
     def has_said(self, *parts: str) -> bool:
         """Tell whether all of these stand in its log."""
-        log = self._log.read_text(encoding='utf-8')
+        log = self.log.read_text(encoding='utf-8')
         return all(part in log for part in parts)
 
     def cpu_seconds(self) -> float:
