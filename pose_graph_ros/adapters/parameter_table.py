@@ -93,7 +93,11 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('closing_silence', 2.0, 's', 'Time without any message after which the whole graph '
               'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
-              'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
+              'such as graph.g2o, in `file_folder`. Files with the suffixes .json and .tum are '
+              'stored next to it.'),
+    Parameter('file_folder', '', '', 'Folder outside of which `~/save_graph` writes and '
+              '`~/load_graph` reads nothing. By default that of `graph_file` at the start, or, if '
+              'that is unset, the one in which the node is started.', change=Change.START),
     Early('load_graph_on_start', False, '', 'Whether to continue with the graph in `graph_file`, '
           'once there is one. If it cannot be loaded, the node is not configured.'),
     Early('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '

@@ -15,6 +15,7 @@ from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETER
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros import log, services, session, topics
+from pose_graph_ros.ros.worker import with_folder
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +37,8 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''  # why the last transition failed
         self._session: session.Session | None = None
         self._offered: services.Services | None = None
-        self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
+        # the node's own parameters that have a value
+        self._given = with_folder(self._declare(PARAMETERS))
         for source in rules.listed_sources(self._given):
             kind = self._declare([rules.type_parameter(source)])[f'{source}.type']
             self._given |= self._declare(rules.source_parameters(source, kind))

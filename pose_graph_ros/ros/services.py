@@ -177,7 +177,8 @@ class Services:
         session, worker = self._session, self._session.worker
         # wait until the worker has prepared the kernels, which reading needs
         worker.call(lambda _: None).result()
-        saved, backend = restored(path, backend_config(session.values))
+        saved, backend = restored(
+            path, session.values['file_folder'], backend_config(session.values))
         done: Future[None] = Future()
 
         def replace() -> None:

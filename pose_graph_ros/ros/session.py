@@ -47,7 +47,7 @@ class Session:
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
-        self._told: dict[str, str] = {}  # what is logged and not over, by its text without numbers
+        self._told: dict[str, str] = {}  # what is logged and not over, by what does not vary
         self.activated_at = math.inf  # by a monotonic clock [s]
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
@@ -58,7 +58,8 @@ class Session:
 
         def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
             self._warm_up(stopped)
-            return None if path is None or stopped() else continued(path, self._config)
+            return None if path is None or stopped() else continued(
+                path, values['file_folder'], self._config)
 
         self._begin(PoseGraphBackend(self._config), prepare, resumes=path is not None)
         if datum is not None:
@@ -151,7 +152,8 @@ class Session:
         self.out.configure(values)
         for name, source in config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
-        self.worker.call(lambda backend: backend.configure(config), 'a change of parameters')
+        self.worker.call(lambda backend: backend.configure(config), 'a change of parameters',
+                         'the newest')
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if self.active:
             self._watch_time()
@@ -281,7 +283,7 @@ class Session:
         """Make the worker's thread publish path and markers that are due."""
         if self.worker.estimate is not None and self.worker.prepared:
             self.worker.call(partial(self.out.publish_views, self.worker, self.out.graph),
-                             'the path or the markers')
+                             'the path or the markers', 'the newest')
 
     def optimize(self) -> 'Future[UpdateReport]':
         """Request a full optimisation, after which the path is published at once."""
@@ -292,7 +294,7 @@ class Session:
             # so that the next path after the answer is the optimised one
             self.out.publish_views(worker, graph, backend, at_once=True)
             return report
-        return worker.call(job, 'the full optimisation')
+        return worker.call(job, 'the full optimisation', 'the one')
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
@@ -306,7 +308,7 @@ class Session:
         level, text, _ = found[0]
         self.out.publish_diagnostics(level, f'{text[0].upper()}{text[1:]}.', values)
         if self.active:
-            present = {log.NUMBER.sub('', each.text): each.text for each in found if each.logged}
+            present = {log.VARYING.sub('', each.text): each.text for each in found if each.logged}
             for key in present.keys() - self._told.keys():
                 logger.warning('%s', present[key])
             for key in self._told.keys() - present.keys():

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
+import os
 from pathlib import Path
 import threading
 import time
@@ -31,6 +32,7 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGra
 from pose_graph_ros.core.geometry import covariance, geodesy, se2
 from pose_graph_ros.core.io import graph_files
 from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph
+from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -44,6 +46,7 @@ Job = Callable[[PoseGraphBackend], Result]
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
 GATHERING = 0.05
+MOST_JOBS = 100  # of a kind that wait; the oldest is dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +89,9 @@ class Worker:
         self.is_optimal = False  # whether the whole graph was optimised since the last update
         self._inbox: deque[tuple[str, Measured]] = deque()
         self._update_wanted = False
-        self._jobs: list[tuple[str, Job[object], Future[object]]] = []
+        # of what, and the key that one of the same kind shares, which takes its place
+        self._jobs: dict[tuple[str, object], tuple[Job[Any], Future[Any]]] = {}
+        self._n_dropped = 0  # number of jobs that were too many
         self._stopping = False
         self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
         self._condition = threading.Condition()
@@ -123,35 +128,45 @@ class Worker:
             self._backend.interrupt_refinement()
             self._condition.notify()
 
-    def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
+    def call(self, job: Job[Result], what: str = 'a job', key: object = None) -> 'Future[Result]':
         """
         Return the future answer of a job, done in the thread after all posted measurements.
 
-        If it fails, that is logged and counted whether or not anybody reads the answer.
+        One with a key takes the place of a job of the same kind and key that waits, and shares its
+        answer; of a kind the newest `MOST_JOBS` wait. If it fails, that is logged and counted
+        whether or not anybody reads the answer.
         """
         future: Future[Result] = Future()
         with self._condition:
             if self._stopping:
                 future.cancel()
             else:
-                self._jobs.append((what, job, future))  # type: ignore[arg-type]
+                name = what, future if key is None else key
+                future = self._jobs.get(name, (job, future))[1]
+                self._jobs[name] = job, future
+                same = [each for each in self._jobs if each[0] == what]
+                if len(same) > MOST_JOBS:
+                    self._jobs.pop(same[0])[1].set_exception(
+                        PoseGraphError(f'dropped: more than {MOST_JOBS} of {what} wait'))
+                    self._n_dropped += 1
                 self._backend.interrupt_refinement()
                 self._condition.notify()
         return future
 
     def decide(self, message: Message) -> None:
         """Hand a decision to the engine, which answers in the log; an update follows at once."""
+        name, text = shortened(message.key.strip()), shortened(message.value.strip().lower())
+
         def act(backend: PoseGraphBackend) -> None:
-            name, text = str(message.key).strip(), str(message.value).strip().lower()
             choices = [decision.value for decision in Decision]
             answer = backend.decide(name, Decision(text)) if text in choices else ms.rejected(
                 'unknown_decision', f'expected one of {", ".join(choices)} as the value for the '
                 f'key {name!r}, got {text!r}')
             refused = answer.status is ms.AnswerStatus.REJECTED
             backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
-            _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
+            _tell(answer, 'nothing is decided', answer.detail)
             self.request_update()   # here, as jobs are done after one that was asked for before
-        self.call(act, 'a decision')
+        self.call(act, 'a decision', name)
 
     def set_pose(self, pose: ms.GlobalPose, map_frame: str) -> None:
         """Hand a pose to the engine, which answers in the log; an update follows at once."""
@@ -161,7 +176,7 @@ class Worker:
             _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
                   f'the pose is set {where}')
             self.request_update()
-        self.call(act, 'a pose that is set')
+        self.call(act, 'a pose that is set', 'the newest')
 
     def _run(self) -> None:
         try:
@@ -178,12 +193,12 @@ class Worker:
                 if self.estimate is not None and not self._may_refine:
                     self._condition.wait_for(self._has_more_to_do, GATHERING)
                 if self._stopping:
-                    for *_, future in self._jobs:
+                    for _, future in self._jobs.values():
                         future.cancel()
                     return
                 batch, self._inbox = self._inbox, deque()
                 wanted, self._update_wanted = self._update_wanted, False
-                jobs, self._jobs = self._jobs, []
+                jobs, self._jobs = self._jobs, {}
             refines = not (wanted or len(batch) + len(jobs) > 0)
             # no error may end the thread, which is the only one that adds measurements
             try:
@@ -194,7 +209,7 @@ class Worker:
             except Exception as error:
                 self._may_refine = False
                 self._count_failure('a refinement' if refines else 'an update', error, len(batch))
-            for what, job, future in jobs:
+            for (what, _), (job, future) in jobs.items():
                 self._do(what, job, future)
 
     def _has_more_to_do(self) -> bool:
@@ -296,8 +311,9 @@ class Worker:
         doubted = {source for source, each in verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
+        counts = backend.counts + Counter({('worker', 'dropped_job'): self._n_dropped})
         self.status = WorkerStatus(
-            processed=status.processed + processed, counts=Counter(backend.counts),
+            processed=status.processed + processed, counts=counts,
             refusals=dict(backend.refusals), pending=backend.n_waiting,
             quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
             report=status.report if report is None else report,
@@ -360,14 +376,34 @@ def _tell(answer: ms.Answer, refused: str, done: str) -> None:
 
 
 def graph_path(values: Mapping[str, Any]) -> Path:
-    """Return the file that graph_file names; raises `ConfigError` if it names none."""
-    if (name := values['graph_file']) == '':
-        raise ConfigError('parameter graph_file: expected the name of a file, such as '
-                          "~/map.g2o, got ''")
+    """Return the file that graph_file names below file_folder; raises `ConfigError` for none."""
+    name, folder = values['graph_file'], Path(values['file_folder'])
+    expected = f'expected the name of a file below {folder}, the file_folder, such as map.g2o'
     try:
-        return Path(name).expanduser().absolute()
-    except RuntimeError as error:
-        raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
+        path = folder / Path(name).expanduser()
+        files = graph_files.graph_paths(path)
+        if '\0' in name or any(len(os.fsencode(each)) > 255 for each in files[1].parts):
+            expected = 'expected names of at most 255 bytes without NUL'
+        # a link may lead anywhere
+        elif name != '' and all(each.resolve().is_relative_to(folder) for each in files):
+            return path.parent.resolve() / path.name
+    except (OSError, RuntimeError, ValueError) as error:
+        expected += f' ({shortened(str(error))})'
+    raise ConfigError(f'parameter graph_file: {expected}, got {shortened(name)!r}')
+
+
+def with_folder(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters of the start, with the folder that `graph_path` stays in as a path."""
+    name, folder = values.get('graph_file', ''), values.get('file_folder', '')
+    try:
+        if folder == '' and name != '':     # relative to where the node is started, this once
+            path = Path(name).expanduser().absolute()
+            name, folder = str(path), path.parent
+        return {**values, 'graph_file': name, 'file_folder': str(
+            Path(folder).expanduser().resolve())}
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ConfigError(f'parameter graph_file or file_folder: {error}, got '
+                          f'{shortened(name)!r}') from error
 
 
 def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOrigin | None]:
@@ -384,7 +420,7 @@ def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOr
             logger.warning('there is no graph in %s yet: starting with an empty one, which '
                            '~/save_graph writes there', path)
             return None, None
-        datum = graph_files.read_datum(path)
+        datum = graph_files.read_datum(path, Path(values['file_folder']))
     except (FileFormatError, OSError) as error:
         raise ConfigError(f'parameter load_graph_on_start: {error}') from error
     if datum is not None and plane is not None and (
@@ -393,10 +429,10 @@ def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOr
     return path, datum
 
 
-def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
+def continued(path: Path, folder: str, config: BackendConfig) -> PoseGraphBackend | None:
     """Return an engine that continues a saved graph; None, which is logged, if that fails."""
     try:
-        saved, backend = restored(path, config)
+        saved, backend = restored(path, folder, config)
     except Exception:
         logger.exception('%s could not be loaded: a new graph is started', path)
         return None
@@ -404,9 +440,11 @@ def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
     return backend
 
 
-def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
-    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
-    saved = graph_files.read_graph(path)
+def restored(
+    path: Path, folder: str, config: BackendConfig,
+) -> tuple[SavedGraph, PoseGraphBackend]:
+    """Return a saved graph in a folder and an engine for it; raises `FileFormatError`."""
+    saved = graph_files.read_graph(path, Path(folder))
     backend = PoseGraphBackend.restored(config, saved)
     backend.update()
     return saved, backend

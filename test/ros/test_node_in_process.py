@@ -71,7 +71,8 @@ class Managed(Driver):
 
 @pytest.fixture
 def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]:
-    values = {'frequency': 50, 'diagnostics_period': 0.02} | getattr(request, 'param', {})
+    values = {'frequency': 50, 'diagnostics_period': 0.02, 'file_folder': str(tmp_path),
+              **getattr(request, 'param', {})}
     overrides = [Parameter(name, value=value) for name, value in values.items()]
 
     def make(context: Context) -> PoseGraphNode:
