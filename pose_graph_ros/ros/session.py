@@ -45,6 +45,7 @@ class Session:
         path, datum = initial_graph(values)
         self.input, self.out = Input(values), publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
+        self._pose_set_at = -math.inf
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
         self._told: dict[str, str] = {}  # what is logged and not over, by what does not vary
@@ -202,12 +203,15 @@ class Session:
             self.input.reject(SET_POSE, answer)
             logger.warning(
                 'the pose is not set: %s: %s', answer.reason, answer.detail, extra=log.ANSWER)
-        self._set_pose()
+        # of more than a person sets the newest is taken with the next update
+        if time.monotonic() - self._pose_set_at > 1.0:
+            self._set_pose()
 
     def _set_pose(self) -> None:
         """Hand the pose that was set, if there is one, to the engine once there is odometry."""
         estimate = self.worker.estimate
         if estimate is not None and (pose := self._set_pose_input.pop(estimate)) is not None:
+            self._pose_set_at = time.monotonic()
             self.out.jump()
             self.worker.set_pose(pose, self.out.map_frame)
 
@@ -234,7 +238,10 @@ class Session:
     def reset(self) -> None:
         """Start a new graph on request; the next messages may have any stamps."""
         self.input.time_jumps.forget()
-        self._start_new_graph('a call of ~/reset')
+        if self.is_loaded or any(each.count > 0 for each in self.input.arrivals.values()):
+            self._start_new_graph('a call of ~/reset')
+        else:   # nothing has come since the last one
+            self.n_resets += 1
 
     def _start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
         """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
