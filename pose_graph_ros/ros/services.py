@@ -22,9 +22,10 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
 from pose_graph_ros.core.io.graph_files import SavedGraph, site_refusal, write_graph
+from pose_graph_ros.ros.graph_folder import graph_path
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.spinning import Spinner
-from pose_graph_ros.ros.worker import graph_path, restored, Worker
+from pose_graph_ros.ros.worker import restored, Worker
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
-import os
 from pathlib import Path
 import threading
 import time
@@ -36,6 +35,7 @@ from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
+from pose_graph_ros.ros.graph_folder import graph_path
 from pose_graph_ros.ros.log import ANSWER, verdict_lines
 
 logger = logging.getLogger(__name__)
@@ -373,37 +373,6 @@ def _tell(answer: ms.Answer, refused: str, done: str) -> None:
         logger.warning('%s: %s: %s', refused, answer.reason, answer.detail, extra=ANSWER)
     else:
         logger.info('%s', done)
-
-
-def graph_path(values: Mapping[str, Any]) -> Path:
-    """Return the file that graph_file names below file_folder; raises `ConfigError` for none."""
-    name, folder = values['graph_file'], Path(values['file_folder'])
-    expected = f'expected the name of a file below {folder}, the file_folder, such as map.g2o'
-    try:
-        path = folder / Path(name).expanduser()
-        files = graph_files.graph_paths(path)
-        if '\0' in name or any(len(os.fsencode(each)) > 255 for each in files[1].parts):
-            expected = 'expected names of at most 255 bytes without NUL'
-        # a link may lead anywhere
-        elif name != '' and all(each.resolve().is_relative_to(folder) for each in files):
-            return path.parent.resolve() / path.name
-    except (OSError, RuntimeError, ValueError) as error:
-        expected += f' ({shortened(str(error))})'
-    raise ConfigError(f'parameter graph_file: {expected}, got {shortened(name)!r}')
-
-
-def with_folder(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters of the start, with the folder that `graph_path` stays in as a path."""
-    name, folder = values.get('graph_file', ''), values.get('file_folder', '')
-    try:
-        if folder == '' and name != '':     # relative to where the node is started, this once
-            path = Path(name).expanduser().absolute()
-            name, folder = str(path), path.parent
-        return {**values, 'graph_file': name, 'file_folder': str(
-            Path(folder).expanduser().resolve())}
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ConfigError(f'parameter graph_file or file_folder: {error}, got '
-                          f'{shortened(name)!r}') from error
 
 
 def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOrigin | None]:
