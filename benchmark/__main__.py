@@ -23,7 +23,7 @@ import traceback
 from benchmark import metrics, ours, report
 from benchmark.section import about, kept_with, Options, say, Section
 
-PAGES = 'engine', 'solve', 'inputs', 'robust', 'window', 'load', 'malformed'
+PAGES = ('engine', 'solve', 'inputs', 'robust', 'window', 'load', 'malformed', 'peers')
 """Modules with a page each: its title, its sections by name, and what it is about."""
 FIRST = PAGES[0]
 

@@ -124,10 +124,13 @@ class Feeder:
     ----------
     environment : mapping
         Of the node; the domain is taken from it.
+    output : type and topic of the output that is noted
 
     """
 
-    def __init__(self, environment: Mapping[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str],
+                 output: tuple[type, str] = (Odometry, 'odometry/filtered')) -> None:
+        self._output = output
         for name in ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOG_DIR', 'AMENT_PREFIX_PATH'):
             os.environ[name] = environment[name]
         self._context, self.domain = Context(), int(environment['ROS_DOMAIN_ID'])
@@ -137,7 +140,7 @@ class Feeder:
         self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', QOS)
         self._takers: dict[int, tuple[Any, Callable[[bytes, int], None]]] = {}
         for kind, topic, take in ((DiagnosticArray, '/diagnostics', self._on_diagnostics),
-                                  (Odometry, 'odometry/filtered', self._on_output)):
+                                  (*output, self._on_output)):
             subscription = self._node.create_subscription(
                 kind, topic, lambda _: None, QOS, raw=True)
             self._takers[subscription.handle.pointer] = subscription, take
@@ -153,7 +156,7 @@ class Feeder:
         """Of the node's newest diagnostics."""
         self._n_diagnostics = 0
         self._n_sent = 0
-        self._stamp_ns, self._way = 1_700_000_000 * SECOND, 0.0
+        self.stamp_ns, self._way = 1_700_000_000 * SECOND, 0.0
         self._newest_output = b''
         self._phase = Phase(0.0)
 
@@ -201,7 +204,7 @@ class Feeder:
     def wait_for_listener(self) -> None:
         """Wait until somebody listens to odometry and sends outputs."""
         self.wait_until(lambda: self._odometry.get_subscription_count() > 0
-                        and self._node.count_publishers('odometry/filtered') > 0, 'somebody is up')
+                        and self._node.count_publishers(self._output[1]) > 0, 'somebody is up')
 
     def wait_until_ready(self) -> None:
         """Wait until the node listens and has its kernels."""
@@ -228,13 +231,13 @@ class Feeder:
         return int(self.values.get(name, 0))
 
     def _advance(self, seconds: float, speed: float) -> None:
-        self._stamp_ns += round(seconds * SECOND)
+        self.stamp_ns += round(seconds * SECOND)
         self._way += seconds * speed
 
     def _send_odometry(self, speed: float) -> int:
         """Send odometry as of now; return when that began [ns]."""
         pose = Prediction(np.array(drifting(self._way)), np.zeros((3, 3)))
-        data = odometry_cdr(self._stamp_ns, pose, _moving(speed), 'odom', 'base_link')
+        data = odometry_cdr(self.stamp_ns, pose, _moving(speed), 'odom', 'base_link')
         self._n_sent += 1
         begin_ns = time.monotonic_ns()
         self._odometry.publish(data)
@@ -245,7 +248,7 @@ class Feeder:
         message = NavSatFix(position_covariance_type=2, position_covariance=(
             SIGMA_FIX**2 * np.diag((1.0, 1.0, 4.0))).ravel())
         message.header.frame_id = 'gps'
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._stamp_ns, SECOND)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.stamp_ns, SECOND)
         message.status.status = 0
         message.latitude, message.longitude, _ = self._plane.to_geodetic(position).tolist()
         self._n_sent += 1
@@ -274,7 +277,7 @@ class Feeder:
 
     def _busy(self) -> bool:
         """Tell whether the node has enough to do for now."""
-        under_way = (self._stamp_ns - stamp_of(self._newest_output)) / (FILL_STEP * SECOND)
+        under_way = (self.stamp_ns - stamp_of(self._newest_output)) / (FILL_STEP * SECOND)
         return (under_way > MOST_UNDER_WAY
                 or self.count('received') - self.count('processed') > MOST_BEHIND)
 
@@ -301,7 +304,7 @@ class Feeder:
             self.listen(due)
             self._advance(1.0 / rate, SPEED)
             sent_ns = self._send_odometry(SPEED)
-            phase.sent_ns[self._stamp_ns] = sent_ns
+            phase.sent_ns[self.stamp_ns] = sent_ns
             phase.late_ns.append(sent_ns - int(due * 1e9))
             if k % every == 0:
                 self._send_fix()
@@ -309,8 +312,8 @@ class Feeder:
         phase.cpu = (cpu_seconds() - cpu) / (time.monotonic() - begin)
         self.listen(time.monotonic() + STRAGGLERS)
         gc.enable()
-        if self._newest_output and stamp_of(self._newest_output) == self._stamp_ns:
-            position = deserialize_message(self._newest_output, Odometry).pose.pose.position
+        if self._newest_output and stamp_of(self._newest_output) == self.stamp_ns:
+            position = deserialize_message(self._newest_output, self._output[0]).pose.pose.position
             x, y = truth(self._way)
             phase.error = math.hypot(position.x - x, position.y - y)
         return phase

@@ -69,6 +69,10 @@ class Process:
         log = self.log.read_text(encoding='utf-8')
         return all(part in log for part in parts)
 
+    def n_lines(self) -> int:
+        """Return how many lines its log has."""
+        return self._log.read_bytes().count(b'\n')
+
     def cpu_seconds(self) -> float:
         """Return the time of the processor that it has taken so far [s]."""
         stat = Path(f'/proc/{self.process.pid}/stat').read_text(encoding='ascii')

@@ -23,6 +23,7 @@ from pose_graph_ros.core import config, exceptions, measurements as ms, quantiti
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
+from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
 from pose_graph_ros.core.odometry.motion import integrated
 
@@ -35,6 +36,9 @@ _REFERENCE_NODE = re.compile(r'x(\d{1,18})')
 _REFERENCE_TIME = re.compile(r'@(\d{1,10})(?:\.(\d{1,9}))?')
 Message = Any
 """A ROS message of any reader."""
+# What others can send without an end is kept as far as a robot needs it: of a name so many
+# characters, of static frames those that came last.
+LONGEST_NAME, MOST_FRAMES = 255, 2000
 
 
 def frame(name: str) -> str:
@@ -123,8 +127,10 @@ class StaticFrames:
     """Static transforms; for each child frame the newest one is used."""
 
     def __init__(self) -> None:
-        # parent, rotation and translation by child frame
+        # parent, rotation and translation by child frame, the newest last
         self._frames: dict[str, tuple[str, FloatArray, FloatArray]] = {}
+        # number of those that were dropped, or ignored as they cannot be used
+        self.counts: Counter[tuple[str, str]] = Counter()
 
     def receive(self, message: Message) -> None:
         """Add the transforms of a tf2_msgs/TFMessage; invalid ones are ignored."""
@@ -134,7 +140,9 @@ class StaticFrames:
             norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
             translation = np.array([t.x, t.y, t.z])
             if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
-                    or not np.all(np.abs(translation) < 1e3)):
+                    or not np.all(np.abs(translation) < 1e3)
+                    or max(len(parent), len(child)) > LONGEST_NAME):
+                self.counts['tf_static', 'ignored'] += 1
                 continue
             x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
             # SciPy's would make each start 0.3 s longer
@@ -142,7 +150,11 @@ class StaticFrames:
                 [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
                 [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
                 [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])
+            self._frames.pop(child, None)
             self._frames[child] = parent, rotation, translation
+            if len(self._frames) > MOST_FRAMES:
+                del self._frames[next(iter(self._frames))]
+                self.counts['tf_static', 'dropped'] += 1
 
     def transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
         """Return rotation and translation of a frame in another one; None if unknown."""
@@ -285,7 +297,7 @@ def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> ms.G
     """
     if (named := frame(message.header.frame_id)) not in ('', *frames):
         return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
-                                       f'{named!r}')
+                                       f'{shortened(named)!r}')
     return pose if isinstance(pose := planar_pose(message.pose.pose), Answer) else ms.GlobalPose(
         stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
 
@@ -320,7 +332,7 @@ def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.Lo
         return ms.LoopClosure(stamp, pose, cov, reference_ns=(int(
             time[1]) * quantities.NANOSECONDS + int((time[2] or '').ljust(9, '0')) + offset_ns))
     return rejected('wrong_frame', f'expected a hidden node such as x42 or a time such as '
-                                   f'@1695.250000000, got {named!r}')
+                                   f'@1695.250000000, got {shortened(named)!r}')
 
 
 def fix(message: Message, source: 'Source', by: Surroundings) -> ms.Fix | Answer:
@@ -384,8 +396,8 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate
     else:
         if (found := by.in_base(message)) is None:
             return rejected('unknown_frame', (
-                f'no transform from {frame(message.header.frame_id)!r} to {by.base_frame!r} on '
-                f'/tf_static: publish it, or set {source.name}.mounting'))
+                f'no transform from {shortened(frame(message.header.frame_id))!r} to '
+                f'{by.base_frame!r} on /tf_static: publish it, or set {source.name}.mounting'))
         up = found[0][2]
         rate = float(up @ (velocity.x, velocity.y, velocity.z))
         variance = up @ np.asarray(values, dtype=float).reshape(3, 3) @ up
@@ -404,7 +416,7 @@ def twist(message: Message, source: 'Source', by: Surroundings) -> OdometrySampl
         if (found := by.in_base(message)) is None:
             return rejected('wrong_frame', (
                 f'expected frame {by.base_frame!r} or one with a transform to it on '
-                f'/tf_static, got {frame(message.header.frame_id)!r}'))
+                f'/tf_static, got {shortened(frame(message.header.frame_id))!r}'))
         # from that of the sensor at its place in the robot's frame
         (x, y, rate), (rotation, place) = twist, found
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])

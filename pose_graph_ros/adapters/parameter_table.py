@@ -96,12 +96,16 @@ PARAMETERS: tuple[Parameter, ...] = (
               'work on the graph is interrupted and undone. Measurements of an update are tried '
               'again in smaller groups, for longer. If 0, there is no limit.', 0.0, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
-              'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
+              'such as graph.g2o, in `file_folder`. Files with the suffixes .json and .tum are '
+              'stored next to it.'),
+    Parameter('file_folder', '', '', 'Folder outside of which `~/save_graph` writes and '
+              '`~/load_graph` reads nothing. By default that of `graph_file` at the start, or, if '
+              'that is unset, the one in which the node is started.', change=Change.START),
     Early('load_graph_on_start', False, '', 'Whether to continue with the graph in `graph_file`, '
           'once there is one. If it cannot be loaded, the node is not configured.'),
-    Early('state_file', '', '', 'File in which the node keeps all that it accepts, such as '
-          '~/.ros/pose_graph.db, and from which it continues when it is started again, also after '
-          'a power failure. If empty, there is none.'),
+    Parameter('state_file', '', '', 'File in which the node keeps all that it accepts, such as '
+              '~/.ros/pose_graph.db, and from which it continues when it is started again, also '
+              'after a power failure. If empty, there is none.', change=Change.START),
     Early('state_period', 1.0, 's', 'Time within which what was accepted is in `state_file`.',
           0.01, 60.0),
     Early('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '

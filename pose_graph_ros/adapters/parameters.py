@@ -23,7 +23,9 @@ from pose_graph_ros.adapters.conversions import datum_of, frame
 from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
 from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE, Values
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.judgement.texts import shortened
 
+LONGEST_TEXT = 4096  # characters of a text, as of the path of a file
 LIKENESS = 0.7  # from which on one name may be meant by another, as difflib measures it
 FRAMES = ('map_frame', 'odom_frame', 'base_link_frame')
 NOTHING = (None, 'null', 'None')
@@ -34,8 +36,8 @@ _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
 _OF_SOURCES = {TYPE.name, *(each.name for kind in KINDS.values()
                             for each in (*OF_ALL, *kind.parameters))}
-_TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'outputs',
-          'qos_overrides', 'use_sim_time', 'start_type_description_service'} | {
+_TAKEN = {'solver', 'worker', 'tf_static', 'received', 'alignment', 'window', 'thinning',
+          'outputs', 'qos_overrides', 'use_sim_time', 'start_type_description_service'} | {
               parameter.name for parameter in PARAMETERS}
 
 
@@ -89,6 +91,7 @@ def checked(given: Values) -> dict[str, Any]:
 
 def unknown(name: str, known: Collection[str]) -> ConfigError:
     """Return the error for a parameter that is not known, with what to do about it."""
+    name = shortened(name)
     hint = explanation(name, known) or 'CHANGELOG.rst has those that are gone'
     return ConfigError(f'parameter {name} is not known: {hint}')
 
@@ -145,6 +148,8 @@ def _checked(parameter: Parameter, default: Value, value: Any) -> Value:
         return float(value)
     if type(value) is not type(default):
         raise _wrong(parameter, type(default).__name__, value)
+    if isinstance(value, str) and (len(value) > LONGEST_TEXT or '\0' in value):
+        raise _wrong(parameter, f'at most {LONGEST_TEXT} characters without NUL', value)
     if len(parameter.choices) > 0 and value not in parameter.choices:
         raise _wrong(parameter, f'one of {", ".join(parameter.choices)}', value)
     is_topic = parameter.name.endswith('.topic') or parameter.name.startswith('outputs.')
@@ -154,7 +159,9 @@ def _checked(parameter: Parameter, default: Value, value: Any) -> Value:
 
 
 def _wrong(parameter: Parameter, expected: str, value: object) -> ConfigError:
-    return ConfigError(f'parameter {parameter.name}: expected {expected}, got {value!r}')
+    return ConfigError(f'parameter {parameter.name}: expected {expected}, got '
+                       + (f'{shortened(value)!r}' if isinstance(value, str) else
+                          shortened(repr(value))))
 
 
 def plain(value: Any) -> Any:

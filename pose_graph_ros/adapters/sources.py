@@ -18,6 +18,7 @@ from pose_graph_ros.adapters.parameter_table import Change, Parameter
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
 from pose_graph_ros.core.quantities import NANOSECONDS
@@ -235,6 +236,11 @@ class MessageReader:
     def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
+        for named in (message.header.frame_id, getattr(message, 'child_frame_id', '')):
+            if len(named) > conversions.LONGEST_NAME:
+                return rejected('long_name', f'expected names of frames of at most '
+                                f'{conversions.LONGEST_NAME} characters, got '
+                                f'{shortened(named)!r}')
         measurement = source.kind.convert(message, source, self.surroundings)
         # the seconds have 31 bits, of which one hour is left for offsets
         return measurement if isinstance(measurement, Answer) or (

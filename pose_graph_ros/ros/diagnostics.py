@@ -25,7 +25,7 @@ from pose_graph_ros.core import alignment, disagreement
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import INTERRUPTED
-from pose_graph_ros.core.judgement.texts import short, total_values
+from pose_graph_ros.core.judgement.texts import short, shortened, total_values
 from pose_graph_ros.core.odometry import motion
 from pose_graph_ros.core.sources import gyro, settings
 from pose_graph_ros.ros.input import EXPECTED
@@ -59,7 +59,8 @@ def values(session: 'Session') -> dict[str, object]:
     if session.replaced is not None:
         found['undo'] = session.replaced
     found |= {f'{source}.{answer}': count
-              for (source, answer), count in sorted((status.counts + rejected).items())}
+              for (source, answer), count in sorted((status.counts + rejected + (
+                  session.input.reader.frames.counts)).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
     found |= {f'{source}.calibrated_{name}': f'{value:.6f}'
               for source, each in status.calibrations.items()
@@ -337,8 +338,8 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
             if found == '':
                 yield f'{name} has no {what}: it is taken for {expected}, the {parameter}'
             elif found != expected:
-                yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
-                       f'{expected!r}: set it, else {consequence}')
+                yield (f'{name} has the {what} {shortened(found)!r}, but the parameter '
+                       f'{parameter} is {expected!r}: set it, else {consequence}')
     elif parent == '' and source.kind.without_frame != '' and (
             source.mounting == 'tf' and not any(source.lever_arm)):  # no parameter stands for it
         yield f'{name} has no frame_id: ' + source.kind.without_frame.format(

@@ -7,7 +7,7 @@ So it reaches /rosout with the node's name, at the level that was asked for. Wha
 an error with each message, is left out and counted.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
 import logging
 import math
@@ -21,7 +21,10 @@ from pose_graph_ros.core.judgement.verdicts import Change, Judged, State
 
 # For which a warning, an error or a way of changes of verdicts is logged once [s].
 REPEAT_PERIOD = 10.0
-NUMBER = re.compile(r'(?<!\w)[-+]?\d[\w.+-]*')  # numbers do not make it another message
+# For so long at most so many of one line of code, whatever they say.
+MOST_LINES = 20
+# Numbers, and what is quoted, which may come from messages, do not make it another message.
+VARYING = re.compile(r"""(?<!\w)(?:[-+]?\d[\w.+-]*|'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")""")
 ANSWER = {'is_answer': True}
 """Argument `extra` of logging functions for what a person has asked for."""
 PACKAGE = __name__.partition('.')[0]
@@ -36,6 +39,9 @@ class NodeLog(logging.Handler):
         # of messages that are like one another, when one was logged [s], and how many came since
         self._logged: dict[tuple[object, ...], float] = {}
         self._left_out: Counter[tuple[object, ...]] = Counter()
+        # of lines of code when the newest were logged [s]
+        self._lines = defaultdict[tuple[str, int], deque[float]](
+            lambda: deque([-math.inf] * MOST_LINES, MOST_LINES))
         logging.getLogger().addHandler(self)
         # the node's logger has a level of its own
         logging.getLogger(PACKAGE).setLevel(logging.DEBUG)
@@ -45,12 +51,13 @@ class NodeLog(logging.Handler):
         Log a record; a warning or an error like another one only after a `REPEAT_PERIOD`.
 
         So is what has a way in which verdicts have changed: `extra={'way': ...}`.
-        Those that answer a person are always logged: `extra=ANSWER`.
+        Those that answer a person are always logged: `extra=ANSWER`. Of no line of code are there
+        more than `MOST_LINES` in that time.
         """
         try:
             repeats = hasattr(record, 'way') or (
                 record.levelno >= logging.WARNING and not hasattr(record, 'is_answer'))
-            if (left_out := self._repeated(record) if repeats else 0) < 0:
+            if (left_out := self._left_out_before(record, repeats=repeats)) < 0:
                 return
             text = self.format(record) + (
                 f' ({left_out} more like it before)' if left_out > 0 else '')
@@ -68,15 +75,25 @@ class NodeLog(logging.Handler):
         except Exception:
             self.handleError(record)
 
-    def _repeated(self, record: logging.LogRecord) -> int:
+    def _left_out_before(self, record: logging.LogRecord, *, repeats: bool) -> int:
         """Return how many records like this one were left out; -1 if this one is to be, too."""
+        line, now = (record.pathname, record.lineno), time.monotonic()
+        if now - self._lines[line][0] < REPEAT_PERIOD:
+            self._left_out[line] += 1
+            return -1
+        if (count := self._repeated(record, now) if repeats else 0) >= 0:
+            self._lines[line].append(now)
+            count += self._left_out.pop(line, 0)
+        return count
+
+    def _repeated(self, record: logging.LogRecord, now: float) -> int:
+        """Return the same by what records say."""
         if (key := getattr(record, 'way', None)) is None:
-            key = record.levelno, record.pathname, record.lineno, NUMBER.sub(
+            key = record.levelno, record.pathname, record.lineno, VARYING.sub(
                 '', record.getMessage())
             if record.exc_info and record.exc_info[2] is not None:
                 raised = traceback.extract_tb(record.exc_info[2])[-1]
                 key += raised.filename, raised.lineno
-        now = time.monotonic()
         if now - self._logged.get(key, -math.inf) < REPEAT_PERIOD:
             self._left_out[key] += 1
             return -1

@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node: its parameters and the transitions of its lifecycle."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 import logging
+import math
+import time
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -15,8 +18,12 @@ from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETER
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros import log, services, session, topics
+from pose_graph_ros.ros.graph_folder import with_folder
 
 logger = logging.getLogger(__name__)
+
+# Of parameters in a second: each is checked with all others, and odometry waits meanwhile.
+MOST_CHANGES = 100
 
 
 class PoseGraphNode(LifecycleNode):
@@ -30,13 +37,15 @@ class PoseGraphNode(LifecycleNode):
     def __init__(self, **node_options: Any) -> None:
         # what a file or the command line gives, also to parameters that are not declared
         self._overrides: dict[str, Any] = {}
+        self._changed_at = deque([-math.inf] * MOST_CHANGES, MOST_CHANGES)  # when, the newest [s]
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = log.NodeLog(self.get_logger())
         self.failure = ''  # why the last transition failed
         self._session: session.Session | None = None
         self._offered: services.Services | None = None
-        self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
+        # the node's own parameters that have a value
+        self._given = with_folder(self._declare(PARAMETERS))
         for source in rules.listed_sources(self._given):
             kind = self._declare([rules.type_parameter(source)])[f'{source}.type']
             self._given |= self._declare(rules.source_parameters(source, kind))
@@ -171,20 +180,23 @@ class PoseGraphNode(LifecycleNode):
         A parameter, also a read-only one, can be set to the value that it has, and one that is
         not set to nothing, so that a node takes what `ros2 param dump` has written of it.
         """
+        if time.monotonic() - self._changed_at[0] < 1.0:
+            return _refused(f'more than {MOST_CHANGES} changes of parameters in a second: wait')
         changes = []
         for parameter in parameter_list:
             name = parameter.name
             if not self.has_parameter(name):
+                self._changed_at.append(time.monotonic())
                 return _refused(rules.unknown(name, self._own))
             value = self._plain(name, parameter.value)
             # rclpy refuses what is read-only; without a value it would undeclare it
-            if (value != [] and not self.describe_parameter(name).read_only) or not rules.is_same(
-                    value, self._plain(name, self.get_parameter(name).value)):
+            if not rules.is_same(value, self._plain(name, self.get_parameter(name).value)):
                 changes.append(parameter if value != [] else RosParameter(
                     name, RosParameter.Type.DOUBLE_ARRAY, []))
         own = {each.name: each.value for each in changes if each.name in self._own}
         if len(changes) == 0:
             return SetParametersResult(successful=True)
+        self._changed_at.append(time.monotonic())
         try:
             given = rules.changed(self._given, own, configured=self._session is not None)
         except ConfigError as error:

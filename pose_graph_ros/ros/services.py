@@ -22,9 +22,10 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
 from pose_graph_ros.core.io.graph_files import SavedGraph, site_refusal, write_graph
+from pose_graph_ros.ros.graph_folder import graph_path
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.spinning import Spinner
-from pose_graph_ros.ros.stored_graphs import graph_path, restored
+from pose_graph_ros.ros.stored_graphs import restored
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -212,7 +213,8 @@ class Services:
         session, worker = self._session, self._session.worker
         # wait until the worker has prepared the kernels, which reading needs
         worker.call(lambda _: None).result()
-        saved, backend = restored(path, backend_config(session.values))
+        saved, backend = restored(
+            path, session.values['file_folder'], backend_config(session.values))
 
         def replace() -> None:
             # in the meantime a datum or parameters may have been set

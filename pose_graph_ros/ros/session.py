@@ -69,10 +69,11 @@ class Session:
         self.input = Input(values, self._publishers)
         self.out = publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
+        self._pose_set_at = -math.inf
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
         self.replaced: Replaced | None = None  # the newest graph with odometry that was replaced
-        self._told: dict[str, str] = {}  # what is logged and not over, by its text without numbers
+        self._told: dict[str, str] = {}  # what is logged and not over, by what does not vary
         self.activated_at = math.inf  # by a monotonic clock [s]
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
@@ -87,7 +88,7 @@ class Session:
             backend = None if journal is None or stopped() else from_journal(
                 journal, self._config, self.input.reader.datum)
             return backend if backend is not None or path is None or stopped() else continued(
-                path, self._config)
+                path, values['file_folder'], self._config)
 
         self._begin(PoseGraphBackend(self._config), prepare,
                     resumes=journal is not None or path is not None)
@@ -190,7 +191,7 @@ class Session:
 
         def keep(_: PoseGraphBackend) -> None:
             worker.keep_state(None if datum.plane is None else datum.plane.origin)
-        return worker.call(keep, 'the state for the journal')
+        return worker.call(keep, 'the state for the journal', 'one is enough')
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
@@ -200,7 +201,8 @@ class Session:
         self.out.configure(values)
         for name, source in config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
-        self.worker.call(lambda backend: backend.configure(config), 'a change of parameters')
+        self.worker.call(lambda backend: backend.configure(config), 'a change of parameters',
+                         'the newest')
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if self.active:
             self._watch_time()
@@ -249,12 +251,15 @@ class Session:
             self.input.reject(SET_POSE, answer)
             logger.warning(
                 'the pose is not set: %s: %s', answer.reason, answer.detail, extra=log.ANSWER)
-        self._set_pose()
+        # of more than a person sets the newest is taken with the next update
+        if time.monotonic() - self._pose_set_at > 1.0:
+            self._set_pose()
 
     def _set_pose(self) -> None:
         """Hand the pose that was set, if there is one, to the engine once there is odometry."""
         estimate = self.worker.estimate
         if estimate is not None and (pose := self._set_pose_input.pop(estimate)) is not None:
+            self._pose_set_at = time.monotonic()
             self.out.jump()
             self.worker.set_pose(pose, self.out.map_frame)
 
@@ -281,7 +286,10 @@ class Session:
     def reset(self) -> None:
         """Start a new graph on request; the next messages may have any stamps."""
         self.input.time_jumps.forget()
-        self._start_new_graph('a call of ~/reset')
+        if self.is_loaded or any(each.count > 0 for each in self.input.arrivals.values()):
+            self._start_new_graph('a call of ~/reset')
+        else:   # nothing has come since the last one
+            self.n_resets += 1
 
     def _publishers(self, source: str) -> set[bytes]:
         """Return the ids of those who publish the topic of a source."""
@@ -354,7 +362,7 @@ class Session:
         """Make the worker's thread publish path and markers that are due."""
         if self.worker.estimate is not None and self.worker.prepared:
             self.worker.call(partial(self.out.publish_views, self.worker, self.out.graph),
-                             'the path or the markers')
+                             'the path or the markers', 'the newest')
 
     def optimize(self) -> 'Future[UpdateReport]':
         """Request a full optimisation, after which the path is published at once."""
@@ -365,7 +373,7 @@ class Session:
             # so that the next path after the answer is the optimised one
             self.out.publish_views(worker, graph, backend, at_once=True)
             return report
-        return worker.call(job, 'the full optimisation')
+        return worker.call(job, 'the full optimisation', 'the one')
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
@@ -379,7 +387,7 @@ class Session:
         level, text, _ = found[0]
         self.out.publish_diagnostics(level, f'{text[0].upper()}{text[1:]}.', values)
         if self.active:
-            present = {log.NUMBER.sub('', each.text): each.text for each in found if each.logged}
+            present = {log.VARYING.sub('', each.text): each.text for each in found if each.logged}
             for key in present.keys() - self._told.keys():
                 logger.warning('%s', present[key])
             for key in self._told.keys() - present.keys():

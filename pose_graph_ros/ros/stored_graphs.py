@@ -16,31 +16,21 @@ from pose_graph_ros.core.io import graph_files
 from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph, site_refusal
 from pose_graph_ros.core.io.journal import Journal
 from pose_graph_ros.core.recovery import recovered
+from pose_graph_ros.ros.graph_folder import graph_path
 
 logger = logging.getLogger(__name__)
-
-
-def graph_path(values: Mapping[str, Any]) -> Path:
-    """Return the file that graph_file names; raises `ConfigError` if it names none."""
-    if values['graph_file'] == '':
-        raise ConfigError('parameter graph_file: expected the name of a file, such as '
-                          "~/map.g2o, got ''")
-    return _path(values, 'graph_file')
-
-
-def _path(values: Mapping[str, Any], parameter: str) -> Path:
-    try:
-        return Path(values[parameter]).expanduser().absolute()
-    except RuntimeError as error:
-        raise ConfigError(f'parameter {parameter}: {values[parameter]!r}: {error}') from error
 
 
 def journal_of(values: Mapping[str, Any]) -> Journal | None:
     """Return the journal in the file that state_file names; None if it names none."""
     if values['state_file'] == '':
         return None
+    try:
+        path = Path(values['state_file']).expanduser().absolute()
+    except RuntimeError as error:
+        raise ConfigError(f'parameter state_file: {error}') from error
     plane = datum_of(values).plane
-    return Journal(_path(values, 'state_file'), values['state_period'], lambda saved: (
+    return Journal(path, values['state_period'], lambda saved: (
         None if plane is None else site_refusal(saved, plane.origin, None)))
 
 
@@ -75,7 +65,7 @@ def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOr
             logger.warning('there is no graph in %s yet: starting with an empty one, which '
                            '~/save_graph writes there', path)
             return None, None
-        datum = graph_files.read_datum(path)
+        datum = graph_files.read_datum(path, Path(values['file_folder']))
     except (FileFormatError, OSError) as error:
         raise ConfigError(f'parameter load_graph_on_start: {error}') from error
     if datum is not None and plane is not None and (
@@ -84,10 +74,10 @@ def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, geodesy.MapOr
     return path, datum
 
 
-def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
+def continued(path: Path, folder: str, config: BackendConfig) -> PoseGraphBackend | None:
     """Return an engine that continues a saved graph; None, which is logged, if that fails."""
     try:
-        saved, backend = restored(path, config)
+        saved, backend = restored(path, folder, config)
     except Exception:
         logger.exception('%s could not be loaded: a new graph is started', path)
         return None
@@ -95,9 +85,11 @@ def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
     return backend
 
 
-def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
-    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
-    saved = graph_files.read_graph(path)
+def restored(
+    path: Path, folder: str, config: BackendConfig,
+) -> tuple[SavedGraph, PoseGraphBackend]:
+    """Return a saved graph in a folder and an engine for it; raises `FileFormatError`."""
+    saved = graph_files.read_graph(path, Path(folder))
     backend = PoseGraphBackend.restored(config, saved)
     backend.update()
     return saved, backend

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import logging
 import threading
 import time
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import covariance, geodesy, se2
 from pose_graph_ros.core.io.journal import Chapter
 from pose_graph_ros.core.io.journal_file import KnownPath
+from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -44,6 +45,7 @@ Job = Callable[[PoseGraphBackend], Result]
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
 GATHERING = 0.05
+MOST_JOBS = 100  # of a kind that wait; the oldest is dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +91,9 @@ class Worker:
         self.is_optimal = False  # whether the whole graph was optimised since the last update
         self._inbox: deque[tuple[str, Measured]] = deque()
         self._update_wanted = False
-        self._jobs: list[tuple[str, Job[object], Future[object]]] = []
+        # of what, and the key that one of the same kind shares, which takes its place
+        self._jobs: dict[tuple[str, object], tuple[Job[Any], Future[Any]]] = {}
+        self._n_dropped = 0  # number of jobs that were too many
         self._stopping = False
         self.watchdog = Watchdog()
         self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
@@ -136,26 +140,36 @@ class Worker:
             self._backend.interrupt()
             self._condition.notify()
 
-    def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
+    def call(self, job: Job[Result], what: str = 'a job', key: object = None) -> 'Future[Result]':
         """
         Return the future answer of a job, done in the thread after all posted measurements.
 
-        If it fails, that is logged and counted whether or not anybody reads the answer.
+        One with a key takes the place of a job of the same kind and key that waits, and shares its
+        answer; of a kind the newest `MOST_JOBS` wait. If it fails, that is logged and counted
+        whether or not anybody reads the answer.
         """
         future: Future[Result] = Future()
         with self._condition:
             if self._stopping:
                 future.cancel()
             else:
-                self._jobs.append((what, job, future))  # type: ignore[arg-type]
+                name = what, future if key is None else key
+                future = self._jobs.get(name, (job, future))[1]
+                self._jobs[name] = job, future
+                same = [each for each in self._jobs if each[0] == what]
+                if len(same) > MOST_JOBS:
+                    self._jobs.pop(same[0])[1].set_exception(
+                        PoseGraphError(f'dropped: more than {MOST_JOBS} of {what} wait'))
+                    self._n_dropped += 1
                 self._backend.interrupt()
                 self._condition.notify()
         return future
 
     def decide(self, message: Message) -> None:
         """Hand a decision to the engine, which answers in the log; an update follows at once."""
+        name, text = shortened(message.key.strip()), shortened(message.value.strip().lower())
+
         def act(backend: PoseGraphBackend) -> None:
-            name, text = str(message.key).strip(), str(message.value).strip().lower()
             self._note('decide', name, text)
             choices = [decision.value for decision in Decision]
             answer = backend.decide(name, Decision(text)) if text in choices else ms.rejected(
@@ -163,9 +177,9 @@ class Worker:
                 f'key {name!r}, got {text!r}')
             refused = answer.status is ms.AnswerStatus.REJECTED
             backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
-            _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
+            _tell(answer, 'nothing is decided', answer.detail)
             self.request_update()   # here, as jobs are done after one that was asked for before
-        self.call(act, 'a decision')
+        self.call(act, 'a decision', name)
 
     def set_pose(self, pose: ms.GlobalPose, map_frame: str) -> None:
         """Hand a pose to the engine, which answers in the log; an update follows at once."""
@@ -176,7 +190,7 @@ class Worker:
             _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
                   f'the pose is set {where}')
             self.request_update()
-        self.call(act, 'a pose that is set')
+        self.call(act, 'a pose that is set', 'the newest')
 
     def _run(self) -> None:
         try:
@@ -196,12 +210,12 @@ class Worker:
                 if self.estimate is not None and not self._may_refine:
                     self._condition.wait_for(self._has_more_to_do, GATHERING)
                 if self._stopping:
-                    for *_, future in self._jobs:
+                    for _, future in self._jobs.values():
                         future.cancel()
                     return
                 batch, self._inbox = self._inbox, deque()
                 wanted, self._update_wanted = self._update_wanted, False
-                jobs, self._jobs = self._jobs, []
+                jobs, self._jobs = self._jobs, {}
             refines = not (wanted or len(batch) + len(jobs) > 0)
             # no error may end the thread, which is the only one that adds measurements
             try:
@@ -212,7 +226,7 @@ class Worker:
             except Exception as error:
                 self._may_refine = False
                 self._count_failure('a refinement' if refines else 'an update', error, len(batch))
-            for what, job, future in jobs:
+            for (what, _), (job, future) in jobs.items():
                 self._do(what, job, future)
 
     def _has_more_to_do(self) -> bool:
@@ -343,8 +357,9 @@ class Worker:
         doubted = {source for source, each in verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
+        counts = backend.counts + Counter({('worker', 'dropped_job'): self._n_dropped})
         self.status = WorkerStatus(
-            processed=status.processed + processed, counts=Counter(backend.counts),
+            processed=status.processed + processed, counts=counts,
             refusals=dict(backend.refusals), pending=backend.n_waiting,
             quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
             report=status.report if report is None else report,

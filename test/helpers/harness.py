@@ -97,7 +97,7 @@ class NodeProcess:
             self.env['ROS_DOMAIN_ID'] = str(domain)
         self._stderr = (log / 'stderr').open('w+')
         arguments = ['--ros-args', '-p', 'diagnostics_period:=0.1', '-p', 'frequency:=10.0',
-                     '-p', 'path_period:=0.1', *arguments]
+                     '-p', 'path_period:=0.1', '-p', f'file_folder:={log.parent}', *arguments]
         self.process = (
             subprocess.Popen([sys.executable, *program, *arguments], env=self.env,
                              stderr=self._stderr) if program

@@ -71,7 +71,8 @@ class Managed(Driver):
 
 @pytest.fixture
 def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]:
-    values = {'frequency': 50, 'diagnostics_period': 0.02} | getattr(request, 'param', {})
+    values = {'frequency': 50, 'diagnostics_period': 0.02, 'file_folder': str(tmp_path),
+              **getattr(request, 'param', {})}
     overrides = [Parameter(name, value=value) for name, value in values.items()]
 
     def make(context: Context) -> PoseGraphNode:
@@ -408,3 +409,47 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed.wait(answer.done, 'it answers')
     assert (answer.result().success, answer.result().message) == (False, REPLACED)
     assert managed.session.worker.estimate is None
+
+
+def test_files_are_written_and_read_in_the_folder_alone_and_those_of_others_stay(
+    managed: Managed, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    outside = tmp_path_factory.mktemp('outside')
+    managed.start()
+    assert not managed.set('file_folder', str(outside))[0]
+    managed.drive(4.0)
+    (tmp_path / 'mine.g2o').write_text('mine')
+    (tmp_path / 'away').symlink_to(outside)
+    for name, words in (
+            (str(outside / 'map'), 'expected the name of a file below'),
+            ('../map', 'expected the name of a file below'), ('away/map', 'below'),
+            ('mine', 'there already, and not of a saved graph'), (300 * 'x', 'at most 255 bytes')):
+        managed.set('graph_file', name)
+        for service in ('save_graph', 'load_graph'):
+            answer = managed.call(service)
+            assert not answer.success
+            assert len(answer.message) < 500
+            assert words in answer.message or (service, name) == ('load_graph', 'mine')
+    assert list(outside.iterdir()) == []
+    assert (tmp_path / 'mine.g2o').read_text() == 'mine'
+    managed.set('graph_file', 'yard/map')
+    assert managed.call('save_graph').success
+    assert managed.call('load_graph').success
+    assert (tmp_path / 'yard' / 'map.tum').exists()
+
+
+def test_more_changes_and_resets_than_a_person_makes_cost_little(managed: Managed) -> None:
+    managed.start()
+    answers = [managed.set('path_period', 1.0 + 0.001 * k) for k in range(150)]
+    assert (True, '') in answers
+    assert 'more than 100 changes of parameters in a second' in answers[-1][1]
+    managed.wait(lambda: managed.set('path_period', 2.0)[0], 'it can be changed again')
+    managed.drive(2.0)
+    before, worker = managed.session.n_resets, managed.session.worker
+    for _ in range(50):
+        managed.session.reset()
+    assert managed.session.n_resets == before + 50
+    assert managed.session.worker is not worker
+    worker = managed.session.worker
+    managed.session.reset()
+    assert managed.session.worker is worker, 'it has nothing yet'

@@ -5,8 +5,8 @@ Writing of several files at once, either all of them completely or none.
 
 Each file is written into a temporary folder beside it and synchronised to the disk. Then all
 are renamed in order; if that fails, the previous files are put back. Only if the machine stops
-during the renaming may new files lie beside old ones. A reader can detect that if the file with
-the checksums of the others comes last.
+during the renaming may new files lie beside old ones. A reader can detect that if one file has
+the checksums of the others.
 """
 
 import contextlib

@@ -114,12 +114,16 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     Return the paths of the g2o, JSON and TUM file of a saved graph, written all or none.
 
     `path` is that of the g2o file, with or without suffix; the other files are beside it.
-    Missing folders are created. If that fails, or the path is a folder, a FileWriteError is
-    raised, and previous files are unchanged.
+    Missing folders are created. If that fails, the path is a folder, or files are there that are
+    not of a saved graph, a FileWriteError is raised, and previous files are unchanged.
     """
     if path.name == '' or os.path.isdir(path):
         raise FileWriteError(f'{path}: is a folder, expected the name of a file')
     paths = graph_paths(path)
+    others = [str(each) for each in paths if os.path.lexists(each)]
+    if len(others) > 0 and not _is_saved_graph(paths[1]):
+        raise FileWriteError(f'{" and ".join(others)}: there already, and not of a saved graph, '
+                             f'whose {paths[1].name} begins with its SHA-256: choose another name')
     g2o = g2o_text(saved.rows).encode('ascii')
     nodes = saved.nodes
     tum = tum_text(Trajectory(nodes.stamps_ns, saved.path)).encode('ascii')
@@ -131,18 +135,31 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     body = (',\n'.join(_lines(members)) + '\n}\n').encode('ascii')
     side = _OPENING + hashlib.sha256(body).hexdigest().encode('ascii') + _MIDDLE + body
     g2o_path, side_path, tum_path = paths
-    write_files({g2o_path: g2o, tum_path: tum, side_path: side})
+    # the one that tells what the others are comes first
+    write_files({side_path: side, g2o_path: g2o, tum_path: tum})
     return paths
 
 
-def read_graph(path: Path) -> SavedGraph:
+def _is_saved_graph(path: Path) -> bool:
+    """Tell whether a JSON file begins as that of a saved graph."""
+    try:
+        with path.open('rb') as file:
+            begin = file.read(len(_OPENING) + _DIGITS + len(_MIDDLE))
+    except OSError:
+        return False
+    return begin.startswith(_OPENING) and begin.endswith(_MIDDLE)
+
+
+def read_graph(path: Path, folder: Path | None = None) -> SavedGraph:
     """
     Read a saved graph, given the path of its g2o file with or without suffix.
+
+    If a folder is given, links that lead out of it are not followed.
 
     Raises FileFormatError if a file is missing, damaged, truncated, of another version or of
     another graph than the one beside it; the message names it, what was expected and found.
     """
-    g2o_path, path, members, g2o = _verified(path)
+    g2o_path, path, members, g2o = _verified(path, folder)
     try:
         hints = get_type_hints(SavedGraph, include_extras=True)
         rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS}
@@ -153,14 +170,14 @@ def read_graph(path: Path) -> SavedGraph:
         raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
 
 
-def read_datum(path: Path) -> MapOrigin | None:
+def read_datum(path: Path, folder: Path | None = None) -> MapOrigin | None:
     """
     Return the datum of a saved graph after a check that its files are whole; None without one.
 
     It takes a third of the time of `read_graph`, and raises FileFormatError in the same cases,
     except for contents that are wrong although their checksum is right.
     """
-    _, path, members, _ = _verified(path)
+    _, path, members, _ = _verified(path, folder)
     try:
         datum: MapOrigin | None = sc.decoded(MapOrigin | None, members['datum'])
         if datum is not None:
@@ -170,12 +187,12 @@ def read_datum(path: Path) -> MapOrigin | None:
     return datum
 
 
-def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
+def _verified(path: Path, folder: Path | None) -> tuple[Path, Path, dict[str, Any], bytes]:
     """Return paths of the g2o and the JSON file, members of the latter, content of the former."""
     if path.name == '':
         raise FileFormatError(f'{path}: expected the name of a file')
     g2o_path, path, _ = graph_paths(path)
-    content = _content(path)
+    content = _content(path, folder)
     begin = len(_OPENING) + _DIGITS
     body = content[begin + len(_MIDDLE):]
     if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
@@ -193,7 +210,7 @@ def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
             f'{path}: expected a {FORMAT} of version {VERSION}, created by pose_graph_ros; this '
             f'one is of version {version!r}, created by {members.get("created_by")!r}: make it '
             'anew from the bag')
-    g2o = _content(g2o_path)
+    g2o = _content(g2o_path, folder)
     if hashlib.sha256(g2o).hexdigest() != members.pop('g2o_sha256', None):
         raise FileFormatError(
             f'{g2o_path}: is damaged, or not the file that {path} was written with')
@@ -211,9 +228,14 @@ def _lines(members: dict[str, Any], indent: str = '') -> Iterator[str]:
             yield f'{indent}{json.dumps(name)}: {text}'
 
 
-def _content(path: Path) -> bytes:
+def _content(path: Path, folder: Path | None) -> bytes:
     try:
-        return path.read_bytes()
+        with path.open('rb') as file:
+            # a link may have been put there after any check of the name
+            real = Path(f'/proc/self/fd/{file.fileno()}').resolve()
+            if folder is not None and not real.is_relative_to(folder):
+                raise FileFormatError(f'{path}: leads out of {folder}')
+            return file.read()
     except (OSError, ValueError) as error:
         raise FileFormatError(f'{path}: cannot be read ({error})') from error
 

@@ -35,6 +35,11 @@ def short(value: float, digits: int = 2) -> str:
     return text.rstrip('0').rstrip('.') if '.' in text else text
 
 
+def shortened(text: str, most: int = 80) -> str:
+    """Return a text of others for people: of one that is too long the begin and its length."""
+    return text if len(text) <= most else f'{text[:most // 2]}... ({len(text)} characters)'
+
+
 def number_of(n: int, kind: vd.Judged) -> str:
     """Return `1 closure` or `2 closures`."""
     return f'{n} {NOUNS[kind][n != 1]}'
@@ -112,9 +117,10 @@ def unknown(name: str, *, has_left: bool) -> Answer:
         return rejected('left_window', f'{name} has left the window of the graph, so nothing can '
                                        'be decided on it any more')
     if re.fullmatch(r'\w+/\d+', name) is not None:
-        return rejected('unknown_id', f'there is no verdict {name!r}: it is none of those listed')
+        return rejected('unknown_id', f'there is no verdict {shortened(name)!r}: it is none '
+                                      'of those listed')
     return rejected('unknown_id', 'expected the id of a verdict, such as loop_closure/17, '
-                                  f'got {name!r}')
+                                  f'got {shortened(name)!r}')
 
 
 def details(verdict: vd.Verdict) -> dict[str, str]:

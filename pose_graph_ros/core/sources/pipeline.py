@@ -41,11 +41,11 @@ class SeenStamps:
         """Tell whether a measurement with the same stamp and reference was added."""
         return self._find(source, measurement) >= 0
 
-    def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
-        """Tell whether the source has a stamp closer than a period to a given one."""
+    def near(self, source: str, stamp_ns: int, period_ns: int) -> int:
+        """Return how many stamps of the source are closer than a period to a given one."""
         stamps, _ = self.columns[source]
-        at = bisect.bisect_right(stamps, stamp_ns - period_ns)
-        return at < len(stamps) and stamps[at] < stamp_ns + period_ns
+        return bisect.bisect_left(stamps, stamp_ns + period_ns) - bisect.bisect_right(
+            stamps, stamp_ns - period_ns)
 
     def add(self, source: str, measurement: ms.PoseMeasurement) -> None:
         stamps, references = self.columns[source]
@@ -133,8 +133,11 @@ class MeasurementPipeline:
             return ms.rejected('duplicate_stamp', f'{source} at {1e-9 * checked.stamp_ns:.3f} s '
                                                   'was received before')
         if settings.minimum_period > 0.0 and self.seen.near(
-                source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
+                source, checked.stamp_ns, round(settings.minimum_period * 1e9)) > 0:
             return ms.rejected('thinned', f'less than {settings.minimum_period} s from another')
+        if self.seen.near(source, checked.stamp_ns, 500_000_000) >= SOURCES.most_in_second:
+            return ms.rejected('too_dense', f'{source} has {SOURCES.most_in_second} measurements '
+                                            f'in the second around {1e-9 * checked.stamp_ns:.3f}')
         answer = self.take(checked, source)
         if answer.status is not ms.AnswerStatus.REJECTED:
             for repair in validated.repairs:

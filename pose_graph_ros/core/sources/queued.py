@@ -82,6 +82,7 @@ class Queued(NamedTuple):
 HELD = 0.01  # sigma of a given place [m]
 LOOSE = 1000.0  # sigma of a start that is no measurement, relative to a node [m]
 MOST_WAITING = 500  # ranges of a beacon that wait; the oldest are dropped
+MOST_BEACONS = 100  # beacons whose ranges wait; those of the oldest are dropped
 DETERMINED = 0.2  # sigma of the place below which it is determined, as a share of the ranges
 DRIFT = 0.02  # of the way between the points, as a share
 
@@ -113,9 +114,14 @@ class Beacons:
         """Add a range, which `take_ready` returns once the beacon has a landmark."""
         ranges = self._waiting.setdefault(waiting.measurement.beacon, [])
         ranges.append(waiting)
-        for dropped in ranges[:-MOST_WAITING]:
-            self._counts[dropped.queued.source, 'dropped_unlocated'] += 1
+        dropped = ranges[:-MOST_WAITING]
         del ranges[:-MOST_WAITING]
+        if len(self._waiting) > MOST_BEACONS:
+            oldest = next(iter(self._waiting))
+            dropped += self._waiting.pop(oldest)
+            self._next_try.pop(oldest, None)
+        for each in dropped:
+            self._counts[each.queued.source, 'dropped_unlocated'] += 1
 
     def take_ready(self, graph: Graph, apply: Callable[[GraphUpdate], bool], *,
                    aligned: bool) -> list[Queued]:
@@ -140,6 +146,7 @@ class Beacons:
                     j=[self.ids[beacon]])) for each in kept]
             if beacon in self.ids or len(kept) == 0:
                 del self._waiting[beacon]
+                self._next_try.pop(beacon, None)
         return ready
 
     def _start(self, beacon: str, graph: Graph, *, aligned: bool) -> GraphUpdate | None:

@@ -12,6 +12,7 @@ class SourceSettings(NamedTuple):
     most_waiting: int = 10_000  # measurements that wait for odometry
     most_unaligned: int = 5000  # measurements that wait for the alignment; the oldest are dropped
     most_refused: int = 1000  # refused loop closures that are remembered
+    most_in_second: int = 500  # measurements of a source with stamps within one second
 
     # --- biases
     bins: int = 64  # in one time constant of correlated errors
