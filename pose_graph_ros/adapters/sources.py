@@ -235,7 +235,10 @@ class MessageReader:
     def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
-        measurement = source.kind.convert(message, source, self.surroundings)
+        try:
+            measurement = source.kind.convert(message, source, self.surroundings)
+        except Exception as error:  # fields of other types, by a definition in a bag
+            return rejected('malformed', f'{type(error).__name__}: {error}')
         # the seconds have 31 bits, of which one hour is left for offsets
         return measurement if isinstance(measurement, Answer) or (
             measurement.stamp_ns <= (2**31 - 3600) * NANOSECONDS) else rejected(
