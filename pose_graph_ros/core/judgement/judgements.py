@@ -123,7 +123,7 @@ class Judgements:
     def find(self, name: str) -> int:
         """Return the row of the constraint with a name, or `LEFT`, or `UNKNOWN`."""
         source, _, text = name.rpartition('/')
-        if source not in self.sources or not text.isdecimal():
+        if source not in self.sources or not text.isdecimal() or len(text) > 18:
             return UNKNOWN
         index, number = self.sources.index(source), int(text)
         found = np.flatnonzero((self.source == index) & (self.number == number))
