@@ -3,6 +3,8 @@
 VENV := $(if $(ROS_DISTRO),.venv-ros,.venv)
 PYTEST_ARGS ?=
 GOLDEN_ARGS ?=
+FUZZ_SECONDS ?= 600
+FUZZ_ARGS ?=
 BENCH_ARGS ?=
 # Modules are byte-compiled when they are first imported, and not in each process anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -17,7 +19,7 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test golden coverage bench lint types fmt lock \
+.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench lint types fmt lock \
 	clean
 
 help:
@@ -27,6 +29,7 @@ help:
 	@echo 'make test    set up, then run the checks (ruff, mypy) and all tests; PYTEST_ARGS="-k word"'
 	@echo 'make coverage    which lines of the engine its own tests run'
 	@echo 'make golden  make the figures of test/golden anew; GOLDEN_ARGS="--check --exact" compares'
+	@echo 'make fuzz    try odd inputs on all that reads, and odd histories; FUZZ_SECONDS=600 each'
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
@@ -59,6 +62,11 @@ coverage: setup-test
 
 golden: setup-test
 	@$(VENV)/bin/python test/golden $(GOLDEN_ARGS)
+
+fuzz: setup-test
+	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		-r test/fuzz/requirements.txt
+	@$(VENV)/bin/python test/fuzz --seconds $(FUZZ_SECONDS) $(FUZZ_ARGS)
 
 bench: setup
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \

@@ -29,6 +29,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from pose_graph_ros.adapters.conversions import StaticFrames
 from pose_graph_ros.adapters.damaged_bags import repair
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, MessageReader, Source
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -401,8 +402,8 @@ def read_static_frames(reader: Bag) -> list[BagMessage]:
         return []
     good = []
     for message in reader.messages([topic]):
-        with suppress(MessageError):
-            message.decode()
+        with suppress(Exception):   # it may have other fields, by a definition in the bag
+            StaticFrames().receive(message.decode())
             good.append(message)
     return good
 

@@ -216,14 +216,28 @@ def checked_together(given: Values) -> dict[str, Any]:
     return values
 
 
+def yaml_value(text: str) -> Any:
+    """Return what a text in YAML says, whose tree is as large as its text; or raise ValueError."""
+    depth = 0
+    try:
+        for event in yaml.parse(text):
+            depth += (isinstance(event, yaml.CollectionStartEvent)
+                      - isinstance(event, yaml.CollectionEndEvent))
+            if depth > 50 or isinstance(event, yaml.AliasEvent):
+                raise ValueError('too deep, or an alias, which ROS does not read either')
+        return yaml.safe_load(text)
+    except Exception as error:  # the parser can raise anything
+        raise ValueError(' '.join(str(error).split())) from error
+
+
 def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
     """Yield what to say of each parameter file that has no section for a node."""
     for option, name in pairwise(arguments):
         if option != '--params-file':
             continue
         try:
-            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
-        except (OSError, ValueError, yaml.YAMLError):
+            content = yaml_value(Path(name).read_text(encoding='utf-8'))
+        except (OSError, ValueError):
             continue  # what rcl cannot read ends the node
         sections = list(_sections(content))
         # with wildcards as rcl matches them

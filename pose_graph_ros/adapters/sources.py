@@ -236,12 +236,15 @@ class MessageReader:
     def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
-        for named in (message.header.frame_id, getattr(message, 'child_frame_id', '')):
-            if len(named) > conversions.LONGEST_NAME:
-                return rejected('long_name', f'expected names of frames of at most '
-                                f'{conversions.LONGEST_NAME} characters, got '
-                                f'{shortened(named)!r}')
-        measurement = source.kind.convert(message, source, self.surroundings)
+        try:
+            for named in (message.header.frame_id, getattr(message, 'child_frame_id', '')):
+                if len(named) > conversions.LONGEST_NAME:
+                    return rejected('long_name', f'expected names of frames of at most '
+                                    f'{conversions.LONGEST_NAME} characters, got '
+                                    f'{shortened(named)!r}')
+            measurement = source.kind.convert(message, source, self.surroundings)
+        except Exception as error:  # fields of other types, by a definition in a bag
+            return rejected('malformed', f'{type(error).__name__}: {error}')
         # the seconds have 31 bits, of which one hour is left for offsets
         return measurement if isinstance(measurement, Answer) or (
             measurement.stamp_ns <= (2**31 - 3600) * NANOSECONDS) else rejected(

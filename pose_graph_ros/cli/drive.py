@@ -328,7 +328,7 @@ def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     samples, poses = array('q'), array('d')
     for bag_message in bag.messages([topic], span):
-        with suppress(MessageError):
+        with suppress(Exception):   # it may have other fields, by a definition in the bag
             message = bag_message.decode()
             pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
             if not isinstance(pose, Answer):

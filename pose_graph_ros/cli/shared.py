@@ -10,10 +10,8 @@ from pathlib import Path
 import sys
 from typing import Any, TypeVar
 
-import yaml
-
 from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.parameters import checked, yaml_value
 from pose_graph_ros.adapters.sources import source_list, Values
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -34,8 +32,8 @@ def parameter_values(options: argparse.Namespace, usual: Values | None = None) -
         if separator == '':
             raise ConfigError(f'--param: expected NAME:=VALUE, got {text!r}')
         try:
-            given[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            given[name] = yaml_value(value)
+        except ValueError as error:
             raise ConfigError(f'--param {name}: {value!r} is not YAML') from error
     return checked(given)
 
@@ -54,8 +52,8 @@ def _read_file(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = yaml_value(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
         raise ConfigError(f'{path}: cannot be read as yaml: {bags.one_line(error)}') from error
     given: dict[str, Any] = {}
     for name, section in (content if isinstance(content, Mapping) else {}).items():

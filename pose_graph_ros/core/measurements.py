@@ -14,7 +14,6 @@ from enum import Enum
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose
-from pose_graph_ros.core.saved_columns import Matrix
 
 # Largest valid coordinate in a map or in odometry [m, rad]; a larger one is a faulty number.
 LARGEST_COORDINATE = 1e9
@@ -27,10 +26,10 @@ class OdometrySample:
     """Pose of the robot in the odometry frame."""
 
     stamp_ns: int
-    pose: Matrix  # `T_odom_base`, shape (3,) [m, m, rad]
+    pose: FloatArray  # `T_odom_base`, shape (3,) [m, m, rad]
     speed: float = 0.0  # of the twist in the same message [m/s]; 0 if it has none
     # of (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown
-    twist_variance: Matrix | None = None
+    twist_variance: FloatArray | None = None
     # (v_x, v_y, yaw rate) in the robot's frame [m/s, m/s, rad/s]; used, and then needed, if the
     # motion of the source is integrated from twists
     twist: Pose | None = None
@@ -50,8 +49,8 @@ class GlobalPose:
     """Pose of the robot in the map."""
 
     stamp_ns: int
-    pose: Matrix  # `T_map_base`, shape (3,) [m, m, rad]
-    covariance: Matrix  # of (x, y, theta) in map axes, shape (3, 3)
+    pose: FloatArray  # `T_map_base`, shape (3,) [m, m, rad]
+    covariance: FloatArray  # of (x, y, theta) in map axes, shape (3, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +58,9 @@ class Position:
     """Position in the map of a point of the robot, such as an antenna."""
 
     stamp_ns: int
-    position: Matrix  # in the map, shape (2,) [m]
-    covariance: Matrix  # in map axes, shape (2, 2)
-    lever_arm: Matrix  # the point in the robot's frame, shape (2,) [m]
+    position: FloatArray  # in the map, shape (2,) [m]
+    covariance: FloatArray  # in map axes, shape (2, 2)
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +76,8 @@ class Fix:
     coordinates: tuple[float, float, float]  # latitude, longitude [deg], altitude [m] or NaN
     # returns their position in the map, shape (2,) [m]
     place: Callable[[float, float, float], FloatArray]
-    covariance: Matrix  # in map axes, shape (2, 2)
-    lever_arm: Matrix  # the point in the robot's frame, shape (2,) [m]
+    covariance: FloatArray  # in map axes, shape (2, 2)
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
 
     def placed(self) -> Position:
         """Return the position in the map."""
@@ -100,10 +99,10 @@ class LoopClosure:
     """Pose of the robot relative to its pose at another stamp, or to a hidden node."""
 
     stamp_ns: int
-    pose: Matrix  # `T_reference_base`, shape (3,) [m, m, rad]
+    pose: FloatArray  # `T_reference_base`, shape (3,) [m, m, rad]
     # Of (x, y, theta) in the axes of the reference pose, shape (3, 3). With infinite variances of
     # x and y only the difference of the headings is used.
-    covariance: Matrix
+    covariance: FloatArray
     # stamp of the reference pose [ns]; None if `reference_node` is given
     reference_ns: int | None = None
     # index of the reference's hidden node; None if `reference_ns` is given
@@ -118,8 +117,8 @@ class Range:
     beacon: str  # name of the beacon
     distance: float  # [m]
     variance: float  # [m^2]; 0 if unknown
-    lever_arm: Matrix  # the point in the robot's frame, shape (2,) [m]
-    place: Matrix | None = None  # of the beacon in the map, shape (2,) [m]; None if unknown
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
+    place: FloatArray | None = None  # of the beacon in the map, shape (2,) [m]; None if unknown
 
 
 Absolute = GlobalPose | Position | HeadingOnly  # measurements relative to the map

@@ -107,6 +107,8 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
         parts.pipeline.queue += saved.waiting
         parts.quarantine.extend(saved.set_aside)
+        parts.reweighting.cost(parts.graph)
+        estimate(parts, saved.newest_covariance, saved.chi2, with_path=True)
     except MISMATCHES as error:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
 

@@ -12,7 +12,7 @@ import logging
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms, saved_columns as sc
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.io.graph_files import SavedGraph
@@ -61,7 +61,7 @@ def _do(backend: PoseGraphBackend, entry: Entry, place: Place) -> None:
         backend.decide(name, Decision(decision))
     elif entry.name == 'set_pose':
         pose, source = entry.values
-        backend.set_pose(sc.decoded(ms.GlobalPose, pose), source)
+        backend.set_pose(measurement_of(pose, place), source)
     elif entry.name == 'optimize':
         backend.optimize()
     else:

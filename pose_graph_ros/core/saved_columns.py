@@ -70,6 +70,8 @@ def decoded(kind: Any, plain: Any) -> Any:
         array = np.empty(len(plain[names[0]]), kind) if names else np.array(plain, dtype=kind)
         for name in names:
             array[name] = np.reshape(plain[name], array[name].shape)
+        if not all(np.all(np.isfinite(array[name])) for name in names or (...,)):
+            raise ValueError('numbers that are not finite')     # are never written
         return arguments[0].of(array) if names else (
             array if shape is None else array.reshape(-1, *shape))
     if origin in (UnionType, Union):     # of something and None

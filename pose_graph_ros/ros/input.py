@@ -355,11 +355,7 @@ class Input:
 
     def read(self, source: str, message: Message) -> Measured | None:
         """Return the measurement of a message; None if it cannot be used, whatever its stamp."""
-        try:
-            measurement = self.reader.convert(source, message)
-        except Exception as error:
-            measurement = rejected('malformed', f'{type(error).__name__}: {error}')
-        if isinstance(measurement, Answer):
+        if isinstance(measurement := self.reader.convert(source, message), Answer):
             self.reject(source, measurement)
             return None
         self.arrivals[source].frames = (

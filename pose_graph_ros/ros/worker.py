@@ -29,7 +29,7 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import covariance, geodesy, se2
 from pose_graph_ros.core.io.journal import Chapter
-from pose_graph_ros.core.io.journal_file import KnownPath
+from pose_graph_ros.core.io.journal_file import KnownPath, plain
 from pose_graph_ros.core.judgement.texts import shortened
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.sources import bias, gyro
@@ -186,7 +186,7 @@ class Worker:
         def act(backend: PoseGraphBackend) -> None:
             x, y, yaw = pose.pose
             where = f'to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {map_frame}'
-            self._note('set_pose', pose, SET_POSE)
+            self._note('set_pose', plain(pose), SET_POSE)
             _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
                   f'the pose is set {where}')
             self.request_update()

@@ -84,9 +84,12 @@ def read_text(path: Path) -> str:
         if content.startswith(_GZIP):
             import gzip  # noqa: PLC0415
 
-            content = gzip.decompress(content)
+            try:
+                content = gzip.decompress(content)
+            except Exception as error:  # of gzip, of zlib or of struct
+                raise OSError(error) from error
         return content.decode('utf-8')
-    except (OSError, EOFError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(f'{path}: cannot be read as text ({error})') from error
 
 

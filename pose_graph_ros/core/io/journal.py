@@ -20,7 +20,6 @@ import threading
 import time
 from typing import Any
 
-from pose_graph_ros.core import saved_columns as sc
 from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.io.journal_file import (
     Batch,
@@ -61,7 +60,7 @@ class Chapter:
     def act(self, name: str, *values: object) -> None:
         """Note what the engine does now, after the measurements that are `taken`."""
         self._acts, self._is_changed = self._acts + 1, True
-        self._journal.put(self, Entry(self.taken, self._acts, name, sc.encoded(values)))
+        self._journal.put(self, Entry(self.taken, self._acts, name, values))
 
     def keep_path(self, path: KnownPath) -> None:
         """Note the path that is about to be published; wait, not for long, until it is safe."""

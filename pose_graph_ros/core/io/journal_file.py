@@ -21,7 +21,7 @@ import shutil
 import sqlite3
 from tempfile import TemporaryDirectory
 import time
-from typing import Any, get_type_hints, IO, NamedTuple
+from typing import Any, IO, NamedTuple
 
 import numpy as np
 
@@ -50,7 +50,8 @@ NOT_MOVED = np.empty(0, MOVED)
 Measured = ms.OdometrySample | ms.Measurement
 Place = Callable[[float, float, float], FloatArray]
 """As `Fix.place`, which is not in the file."""
-MEASURED = {kind.__name__: kind for kind in (
+TUPLES = 'twist', 'coordinates'     # fields of measurements that are no arrays
+MEASURED: dict[str, Any] = {kind.__name__: kind for kind in (
     ms.OdometrySample, ms.YawRate, ms.GlobalPose, ms.Position, ms.Fix, ms.HeadingOnly,
     ms.LoopClosure, ms.Range)}
 
@@ -116,10 +117,10 @@ def plain(measurement: Measured) -> list[Any]:
 def measurement_of(values: Any, place: Place) -> Any:
     """Return the measurement that `plain` was given; raises one of `MISMATCHES` if it is none."""
     name, fields = values
-    kind: Any = MEASURED[name]
-    hints = get_type_hints(kind, include_extras=True)
-    known = {key: sc.decoded(hints[key], each) for key, each in fields.items()}
-    return kind(**known, place=place) if kind is ms.Fix else kind(**known)
+    known = {key: tuple(each) if key in TUPLES else np.array(each) if isinstance(each, list)
+             else each for key, each in fields.items() if each is not None}
+    kind = MEASURED[name]
+    return kind(**known, **({'place': place} if kind is ms.Fix else {}))
 
 
 class JournalFile:
