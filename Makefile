@@ -6,6 +6,10 @@ GOLDEN_ARGS ?=
 FUZZ_SECONDS ?= 600
 FUZZ_ARGS ?=
 BENCH_ARGS ?=
+SOAK_DAYS ?= 30
+SOAK_HOURS ?= 5
+SOAK_MINUTES ?= 60
+SOAK_OUT ?= build/soak
 # Modules are byte-compiled when they are first imported, and not in each process anew.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -19,8 +23,8 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench lint types fmt lock \
-	clean
+.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench soak lint types fmt \
+	lock clean
 
 help:
 	@echo 'make demo    set up, then simulate a drive, replay it through the node and judge the result'
@@ -31,6 +35,8 @@ help:
 	@echo 'make golden  make the figures of test/golden anew; GOLDEN_ARGS="--check --exact" compares'
 	@echo 'make fuzz    try odd inputs on all that reads, and odd histories; FUZZ_SECONDS=600 each'
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
+	@echo 'make soak    a month through the engine and an hour through the node: hours, at low priority;'
+	@echo '             [SOAK_DAYS=30] [SOAK_HOURS=5 a day] [SOAK_MINUTES=60] [SOAK_OUT=build/soak]'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
 	@echo '             compiles the solver'
@@ -72,6 +78,12 @@ bench: setup
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
 		-r benchmark/requirements.txt
 	@$(VENV)/bin/python -m benchmark $(BENCH_ARGS)
+
+soak: setup
+	@nice $(VENV)/bin/python -m benchmark.soak engine --days $(SOAK_DAYS) --hours $(SOAK_HOURS) \
+		-o $(SOAK_OUT)
+	@nice $(VENV)/bin/python -m benchmark.soak node --minutes $(SOAK_MINUTES) -o $(SOAK_OUT)
+	@$(VENV)/bin/python -m benchmark.soak page -o $(SOAK_OUT)
 
 lint: setup-test
 	$(VENV)/bin/ruff check

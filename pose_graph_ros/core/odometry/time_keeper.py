@@ -135,7 +135,9 @@ class TimeKeeper:
         if is_evidence and not decides and 2 * (others_ns - watch.others_ns) > lasts_ns:
             watch.newest_ns = 0
         begins_again, can_decide = stamp_ns < earliest_ns, decides or watch.newest_ns > 0
-        watch.in_doubt = begins_again and can_decide and self.may_begin_again(source)
+        # what has gone on for less than a second is hardly a present
+        watch.in_doubt = begins_again and can_decide and (
+            now_ns - self._since_ns < EVIDENCE_NS or self.may_begin_again(source))
         if begins_again and can_decide and not watch.in_doubt:
             return Judgement(self._refusal(source, stamp_ns))
         if is_evidence and can_decide:

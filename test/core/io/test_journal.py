@@ -295,3 +295,16 @@ def test_a_chapter_with_a_state_replaces_the_one_before_with_its_first_checkpoin
     then = begun.killed()
     assert len(path_of(then.backend).poses) == length
     then.journal.close(5.0)
+
+
+def test_a_checkpoint_of_a_drive_that_goes_on_is_written_like_the_first(tmp_path: Path) -> None:
+    one = Drive(tmp_path, BackendConfig())
+    for event in events(next(iter(CONFIGS)))[:300]:
+        one.feed(event)
+    one.checkpoint()
+    one.keep_path()
+    one = one.killed()
+    one.checkpoint()
+    one.keep_path()
+    assert one.journal.failure == ''
+    one.journal.close(5.0)

@@ -72,6 +72,14 @@ def test_time_does_not_begin_again_where_it_may_not(away: float) -> None:
     assert [one.send(each) for each in stamps] == 45 * ['refused'] + ['again'] + 54 * ['used']
 
 
+def test_first_stamps_that_are_far_ahead_hold_nobody_up() -> None:
+    one = Given(began=False)
+    one.keeper.may_begin_again = lambda _: False
+    assert one.answers(NOW + 4e8, NOW + 4e8 + 0.1) == {'used'}
+    answers = [one.send(NOW + 0.1 * step) for step in range(50)]
+    assert answers == 10 * ['refused'] + ['again'] + 39 * ['used']
+
+
 def test_after_a_long_silence_time_goes_on_once_stamps_agree_for_a_second() -> None:
     one, stamps = Given(), [NOW + 3600.0 + 0.1 * step for step in range(40)]
     assert [one.send(each) for each in stamps] == 10 * ['refused'] + 30 * ['used']
