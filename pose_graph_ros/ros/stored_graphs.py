@@ -43,7 +43,12 @@ def from_journal(journal: Journal, config: BackendConfig, datum: Datum) -> PoseG
         return None
     if state is not None and state.saved.datum is not None:
         datum.keep(state.saved.datum)
-    backend = recovered(config, found, datum.place)
+    try:
+        backend = recovered(config, found, datum.place)
+    except Exception as error:
+        logger.exception('nothing can be made of the journal: starting with an empty graph')
+        journal.set_aside(f'nothing can be made of it: {error}')
+        return None
     logger.info('continuing with %d hidden nodes from the journal: %d of its checkpoint, and %d '
                 'measurements after it%s', len(backend.node_stamps_ns),
                 0 if state is None else len(state.saved.nodes.ids), n,

@@ -30,7 +30,7 @@ MACHINE = 'histories'
 # What atheris instruments, and of the engine only what reads: what Numba compiles must stay as it
 # is.
 INSTRUMENTED = 'pose_graph_ros', 'rosbags', 'yaml', 'ruamel'
-READING = re.compile(r'core/(io/.*|saved_columns|parts|sources/(validation|kinds))\.py')
+READING = re.compile(r'core/(io/.*|saved_columns|parts|recovery|sources/(validation|kinds))\.py')
 LONGEST = 20  # that an input may take [s]: four times what it may without instruments
 MEMORY = 1500  # that a process may take [MB]
 LARGEST = 20_000  # input [bytes]

@@ -8,10 +8,11 @@ Whatever the bytes, only errors of this package may come of them, each with a me
 
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 import hashlib
 import json
 from pathlib import Path
+import sqlite3
 import tempfile
 from types import SimpleNamespace
 from typing import Any
@@ -28,6 +29,8 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io import g2o, graph_files
+from pose_graph_ros.core.io.journal_file import Batch, Entry, JournalFile
+from pose_graph_ros.core.recovery import recovered
 
 Target = Callable[[bytes, Path], None]
 CORPUS = Path(__file__).parent / 'corpus'
@@ -147,6 +150,38 @@ def saved_text(data: bytes, folder: Path) -> None:
     text, _, body = data.partition(b'\0')
     digest = hashlib.sha256(text).hexdigest().encode()
     _read_saved(folder / 'saved.json', body.replace(b'DIGEST', digest), text)
+
+
+def journal_file(data: bytes, folder: Path) -> None:
+    """The file of a journal, which is always read, as far as it is whole."""
+    path = folder / 'state.db'
+    path.write_bytes(data)
+    _recover(path)
+
+
+def journal_rows(data: bytes, folder: Path) -> None:
+    """A journal whose log, and behind a zero its state, are these texts, with the right sums."""
+    path = folder / 'state.db'
+    file = JournalFile(path)
+    file.write(Batch(entries=[Entry(0, 1, 'update', [])]))
+    file.close()
+    log, _, state = data.partition(b'\0')
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute('UPDATE log SET content = ?, digest = ?', (
+            log, hashlib.sha256(log).digest()))
+        if len(state) > 0:
+            connection.execute('INSERT INTO state VALUES (1, ?, ?)', (
+                hashlib.sha256(state).digest(), state))
+    _recover(path)
+
+
+def _recover(path: Path) -> None:
+    file = JournalFile(path)
+    found = file.read(lambda _: None)
+    file.close()
+    backend = recovered(BackendConfig(), found, lambda *_: np.zeros(2))
+    backend.update()
+    backend.estimate()
 
 
 def _read_bag(path: Path) -> None:
@@ -283,7 +318,8 @@ def _fields(message: SimpleNamespace) -> Iterator[tuple[SimpleNamespace, str]]:
 
 TARGETS: dict[str, Target] = {target.__name__: target for target in (
     graph_text, saved_text, saved_values, bag_mcap, bag_sqlite, bag_ros1, bag_folder,
-    parameter_file, parameter_options, message_bytes, message_fields, transforms)}
+    journal_file, journal_rows, parameter_file, parameter_options, message_bytes, message_fields,
+    transforms)}
 
 
 def run_target(name: str, data: bytes) -> None:

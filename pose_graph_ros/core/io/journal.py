@@ -104,6 +104,7 @@ class Journal:
         self._items = deque[Item]()
         self._condition = threading.Condition()
         self._is_wanted = self._closing = False
+        self._unusable = ''  # why what was found cannot be used
         self._n_chapters, self._chapter = 0, Chapter(self, 0)
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
@@ -129,6 +130,10 @@ class Journal:
                 self._is_wanted = True
                 self._condition.notify()
         return event
+
+    def set_aside(self, why: str) -> None:
+        """Keep the file as it is, as no engine can be made of it, and write a new one."""
+        self._unusable = why
 
     @property
     def size(self) -> int:
@@ -206,6 +211,10 @@ class Journal:
         return batch
 
     def _write(self, batch: Batch) -> None:
+        if self._unusable != '':
+            self._file.close()
+            self._file.set_aside(self._unusable)
+            self._unusable, self.has_gap = '', True
         if self._file.is_lost:
             self._fail(FileNotFoundError('it was removed or replaced'))
             self._file.close()

@@ -164,7 +164,7 @@ class JournalFile:
         if found.state is not None and (refused := refusal(found.state.saved)) is not None:
             found = Found(trouble=refused)
         if found.trouble != '':
-            self._set_aside(found.trouble)
+            self.set_aside(found.trouble)
             self.write(Batch(
                 entries=[*found.entries], path=found.path, checkpoint=found.state))
         self._is_read = True
@@ -190,7 +190,7 @@ class JournalFile:
         if connection is None:
             self._claim()
             if not self._is_read and self.path.exists():
-                self._set_aside('it could not be read at the start')
+                self.set_aside('it could not be read at the start')
             connection, self._parts = _connected(self.path)
             self._connection, self._identity = connection, _identity(self.path)
             self._is_read = True
@@ -245,7 +245,8 @@ class JournalFile:
                     time.sleep(0.1)
             self._lock = lock
 
-    def _set_aside(self, why: str) -> None:
+    def set_aside(self, why: str) -> None:
+        """Rename the file, which is not open."""
         stamp = time.strftime('%Y%m%dT%H%M%S', time.gmtime())
         names = (f'{self.path.name}.bad-{stamp}' + ('' if k == 0 else f'-{k}')
                  for k in range(1000))
