@@ -308,9 +308,10 @@ class Session:
     def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:
         """Replace the graph by one that was loaded."""
         self.input.time_jumps.forget()
-        self._replace(backend, f'the graph in {name} was loaded', resumes=True)
+        reader = MessageReader(self.values, self.input.reader.frames, self.input.reader.keeper)
         if saved.datum is not None:
-            self.input.reader.datum.keep(saved.datum)
+            reader.datum.keep(saved.datum)
+        self._replace(backend, f'the graph in {name} was loaded', resumes=True, reader=reader)
 
     def undo_reset(self, replaced: Replaced) -> None:
         """Exchange the graph for the one that was replaced, whose worker has ended."""
