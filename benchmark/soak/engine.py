@@ -18,6 +18,7 @@ import time
 import numpy as np
 
 from benchmark.parts import resident_bytes
+from benchmark.soak.held import held
 from benchmark.soak.life import Event, EXPECTED, Life, PIECE
 from pose_graph_ros.adapters.conversions import Datum
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -41,6 +42,7 @@ class Hour:
 
     hours: float    # at work so far
     resident: float     # memory of the process [MB]
+    held: float     # what the engine holds [MB]
     nodes: int  # hidden nodes of the path so far
     kept: int   # nodes in the graph
     update_mean: float  # [ms]
@@ -63,7 +65,7 @@ class Hour:
 class Robot:
     """An engine that is killed now and then, and what is counted of it."""
 
-    def __init__(self, folder: Path, datum: Datum, config: BackendConfig = CONFIG) -> None:
+    def __init__(self, folder: Path, datum: Datum, config: BackendConfig) -> None:
         self._config, self._datum, self._folder = config, datum, folder / '0'
         self._folder.mkdir(parents=True)
         self.backend, self.kills = self._open(), 0
@@ -159,13 +161,14 @@ class Robot:
         self.journal.close(PATIENCE)
 
 
-def run(life: Life, folder: Path, part: float = 1.0) -> Iterator[Hour]:
+def run(life: Life, folder: Path, part: float = 1.0, config: BackendConfig = CONFIG,
+        kill_every: int = KILL_EVERY) -> Iterator[Hour]:
     """Run a life, and yield what became of each part of it [h]; the journal is in a folder."""
-    robot, rng = Robot(folder, life.datum), np.random.default_rng((life.seed, 1))
+    robot, rng = Robot(folder, life.datum, config), np.random.default_rng((life.seed, 1))
     each = max(round(3600 * part / PIECE), 1)
     due, found = 0, _Found()
     for k, piece in enumerate(life.pieces(), 1):
-        kill = rng.integers(len(piece.events)) if k % KILL_EVERY == 0 else -1
+        kill = rng.integers(len(piece.events)) if k % kill_every == 0 else -1
         if piece.begins and k > 1:
             robot.kill()
         for n, event in enumerate(piece.events):
@@ -210,7 +213,8 @@ class _Found:
         refused = {key: n for key, n in answers.items() if not key.endswith(' accepted')}
         ms = 1e3 * np.array(self.updates)
         return Hour(
-            hours, 1e-6 * resident_bytes(), len(path.stamps_ns), robot.backend.graph.n_nodes,
+            hours, 1e-6 * resident_bytes(), 1e-6 * held(robot.backend).total(),
+            len(path.stamps_ns), robot.backend.graph.n_nodes,
             float(np.mean(ms)), float(np.percentile(ms, 99)), float(np.max(ms)),
             float(np.mean(self.work)), 1e3 * float(np.mean(self.paths)),
             1e3 * float(np.mean(self.checkpoints)), 1e-6 * max(self.sizes), robot.kills,
