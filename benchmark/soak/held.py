@@ -1,9 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What an object holds in memory, found by following all that it refers to."""
+"""What an object of the engine holds in memory, found by following all that it refers to."""
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from functools import partial
 import sys
 import types
 from typing import Any
@@ -39,7 +40,9 @@ def _inside(item: Any) -> Iterator[tuple[str, Any]]:
         yield from (('[]', each) for each in item)
     elif isinstance(item, types.MethodType):
         yield '', item.__self__
-    elif not isinstance(item, np.ndarray | str | bytes):
+    elif isinstance(item, partial):
+        yield from (('', each) for each in (item.func, item.args, item.keywords))
+    elif type(item).__module__.startswith('pose_graph_ros'):    # and not into libraries
         for name, value in getattr(item, '__dict__', {}).items():
             yield f'.{name}', value
         for kind in type(item).__mro__:

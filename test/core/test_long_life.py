@@ -13,13 +13,16 @@ from pose_graph_ros.core.config import BackendConfig, WindowConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 WINDOW = 150    # hidden nodes
-A_NODE = 200
-"""A node that has left the graph may cost so much, with the room that arrays grow into [bytes]."""
+PARTS, RATE = 8, 4  # and the rate of odometry [Hz]
+FULL = 4    # part from which on the windows of graph and learning are full
+# A node that has left the graph may cost so much, with the room that arrays grow into [bytes], and
+# the rest may be larger by so much by chance.
+A_NODE, CHANCE = 100, 0.02
 
 
 @pytest.fixture(scope='module')
 def life(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """Half an hour by parts of ten minutes, each with a kill, and what was logged."""
+    """Eight parts of ten minutes, with a kill in the first, and what was logged."""
     logged = list[str]()
     handler = logging.Handler(logging.INFO)
     handler.emit = lambda record: logged.append(record.getMessage())  # type: ignore[method-assign]
@@ -27,10 +30,11 @@ def life(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         patch.syspath_prepend(ROOT)
         from benchmark.soak import engine, life as lives  # noqa: PLC0415
 
+        patch.setattr(lives, 'RATE', RATE)
         logging.getLogger('pose_graph_ros').addHandler(handler)
         parts = [*engine.run(
-            lives.Life(1, 0.5, Datum(engine.DATUM)), tmp_path_factory.mktemp('life'), 1 / 6,
-            BackendConfig(window=WindowConfig(nodes=WINDOW)), kill_every=1)]
+            lives.Life(1, PARTS / 6, Datum(engine.DATUM)), tmp_path_factory.mktemp('life'), 1 / 6,
+            BackendConfig(window=WindowConfig(nodes=WINDOW)), kills={1})]
         logging.getLogger('pose_graph_ros').removeHandler(handler)
     return SimpleNamespace(parts=parts, logged=logged)
 
@@ -39,9 +43,9 @@ def test_every_measurement_is_accepted_or_refused_as_it_was_meant_over_all_resta
     life: SimpleNamespace,
 ) -> None:
     last = life.parts[-1]
-    assert last.kills == 3
-    assert (last.lost, last.unexpected) == (0, 0), last.answers
-    assert last.answers['odom accepted'] == 1800 * 20
+    assert last.kills == 1
+    assert (last.lost, last.forgotten, last.unexpected) == (0, 0, 0), last.answers
+    assert last.answers['odom accepted'] == PARTS * 600 * RATE
 
 
 def test_a_restart_moves_no_node(life: SimpleNamespace) -> None:
@@ -49,13 +53,14 @@ def test_a_restart_moves_no_node(life: SimpleNamespace) -> None:
 
 
 def test_memory_grows_by_the_path_alone(life: SimpleNamespace) -> None:
-    _, first, last = life.parts
+    first, last = life.parts[FULL], life.parts[-1]
     assert last.kept == pytest.approx(first.kept, abs=20)
-    assert 1e6 * (last.held - first.held) <= A_NODE * (last.nodes - first.nodes)
+    path = 1e-6 * A_NODE * (last.nodes - first.nodes)
+    assert last.held <= (1.0 + CHANCE) * first.held + path
 
 
 def test_an_update_eliminates_as_little_as_in_the_beginning(life: SimpleNamespace) -> None:
-    _, first, last = life.parts
+    first, last = life.parts[FULL], life.parts[-1]
     assert last.update_work <= 1.5 * first.update_work
 
 
