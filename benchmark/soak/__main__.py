@@ -18,6 +18,7 @@ from dataclasses import asdict
 import json
 import logging
 from pathlib import Path
+import signal
 import sys
 import tempfile
 import time
@@ -94,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('-o', '--out', type=Path, default=Path('build/soak'))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)   # also end the node on SIGTERM
     PARTS[options.part](options)
     return 0
 

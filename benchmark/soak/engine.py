@@ -8,7 +8,7 @@ away, and an engine of what the copy holds goes on. Times are those of the proce
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 import gc
 from pathlib import Path
@@ -18,6 +18,7 @@ import time
 import numpy as np
 
 from benchmark.parts import resident_bytes
+from benchmark.soak.held import held
 from benchmark.soak.life import Event, EXPECTED, Life, PIECE
 from pose_graph_ros.adapters.conversions import Datum
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -31,7 +32,7 @@ CONFIG = BackendConfig(window=WindowConfig(nodes=2000))
 DATUM = 48.1, 11.6
 SOURCES = 'odom', 'fix', 'loop_closure'
 UPDATE_NS = 3_000_000_000   # between two updates
-KILL_EVERY = 7  # pieces from one kill to the next; a day also begins with one
+KILL_EVERY = 7  # pieces from one kill to the next; each day but the first begins with one
 PATIENCE = 120.0    # longest wait for the disk [s]
 
 
@@ -41,6 +42,7 @@ class Hour:
 
     hours: float    # at work so far
     resident: float     # memory of the process [MB]
+    held: float     # what the engine holds [MB]
     nodes: int  # hidden nodes of the path so far
     kept: int   # nodes in the graph
     update_mean: float  # [ms]
@@ -56,6 +58,7 @@ class Hour:
     rms: float  # of the newest pose, without the settling after a kill [m]
     path_rms: float     # of the whole path [m]
     lost: int   # measurements that are neither accepted nor refused nor waiting, so far
+    forgotten: int  # those whose answer was another one when the journal was read, so far
     unexpected: int     # those refused for another reason than intended, so far
     answers: dict[str, int] = field(default_factory=dict)   # so far
 
@@ -63,13 +66,14 @@ class Hour:
 class Robot:
     """An engine that is killed now and then, and what is counted of it."""
 
-    def __init__(self, folder: Path, datum: Datum, config: BackendConfig = CONFIG) -> None:
+    def __init__(self, folder: Path, datum: Datum, config: BackendConfig) -> None:
         self._config, self._datum, self._folder = config, datum, folder / '0'
         self._folder.mkdir(parents=True)
         self.backend, self.kills = self._open(), 0
         self.sent = Counter[str]()
         self.before = Counter[tuple[str, str]]()    # answers that no engine counts any more
-        self.recovery = self.moved = 0.0
+        self.checkpointed = Counter[tuple[str, str]]()  # those that the state has, not the log
+        self.recovery, self.moved, self.forgotten = 0.0, 0.0, 0
 
     def _open(self) -> PoseGraphBackend:
         self.journal = Journal(self._folder / 'state.db', 1.0)
@@ -110,6 +114,7 @@ class Robot:
         saved = self.backend.saved(self._datum.plane.origin if self._datum.plane else None)
         taken = time.thread_time() - begin
         self.chapter.checkpoint(saved, self.backend.pending, taken)
+        self.checkpointed = Counter(self.backend.counts)
         return taken
 
     def _wait(self, path: KnownPath) -> None:
@@ -136,6 +141,11 @@ class Robot:
             self.moved = max(self.moved, float(np.max(np.abs(new.poses - old.poses))))
         counts.subtract(self.backend.counts)
         self.before.update(counts)
+        # an engine that goes on counts what it has from the log
+        counts.subtract(self.checkpointed)
+        self.forgotten += sum(abs(n) for (source, answer), n in counts.items()
+                              if source in SOURCES and answer != 'jump')
+        self.checkpointed = Counter()
 
     def known_path(self) -> KnownPath:
         """Return the hidden nodes."""
@@ -159,13 +169,14 @@ class Robot:
         self.journal.close(PATIENCE)
 
 
-def run(life: Life, folder: Path, part: float = 1.0) -> Iterator[Hour]:
-    """Run a life, and yield what became of each part of it [h]; the journal is in a folder."""
-    robot, rng = Robot(folder, life.datum), np.random.default_rng((life.seed, 1))
+def run(life: Life, folder: Path, part: float = 1.0, config: BackendConfig = CONFIG,
+        kills: Container[int] = range(KILL_EVERY, 1_000_000, KILL_EVERY)) -> Iterator[Hour]:
+    """Run a life with kills in some pieces, and yield what became of each part of it [h]."""
+    robot, rng = Robot(folder, life.datum, config), np.random.default_rng((life.seed, 1))
     each = max(round(3600 * part / PIECE), 1)
     due, found = 0, _Found()
     for k, piece in enumerate(life.pieces(), 1):
-        kill = rng.integers(len(piece.events)) if k % KILL_EVERY == 0 else -1
+        kill = rng.integers(len(piece.events)) if k in kills else -1
         if piece.begins and k > 1:
             robot.kill()
         for n, event in enumerate(piece.events):
@@ -210,10 +221,11 @@ class _Found:
         refused = {key: n for key, n in answers.items() if not key.endswith(' accepted')}
         ms = 1e3 * np.array(self.updates)
         return Hour(
-            hours, 1e-6 * resident_bytes(), len(path.stamps_ns), robot.backend.graph.n_nodes,
+            hours, 1e-6 * resident_bytes(), 1e-6 * held(robot.backend).total(),
+            len(path.stamps_ns), robot.backend.graph.n_nodes,
             float(np.mean(ms)), float(np.percentile(ms, 99)), float(np.max(ms)),
             float(np.mean(self.work)), 1e3 * float(np.mean(self.paths)),
             1e3 * float(np.mean(self.checkpoints)), 1e-6 * max(self.sizes), robot.kills,
             robot.recovery, robot.moved, float(np.mean(self.squares))**0.5,
-            float(np.mean(np.sum(off**2, axis=1)))**0.5, robot.lost,
+            float(np.mean(np.sum(off**2, axis=1)))**0.5, robot.lost, robot.forgotten,
             sum(n for key, n in refused.items() if key not in EXPECTED), dict(answers))

@@ -61,9 +61,9 @@ CHANGES: dict[str, Callable[[random.Random], object]] = {
     'window.nodes': lambda draw: float(draw.randrange(500, 3000)),
     'odom.maximum_speed': lambda draw: draw.uniform(20.0, 100.0),
     'fix.covariance_scale': lambda draw: draw.uniform(0.5, 2.0),
-    'fix.robust': lambda draw: draw.choice(('judged', 'loss', 'none')),
-    'loop_closure.robust': lambda draw: draw.choice(('judged', 'loss', 'none'))}
-"""What may change while the node runs, and what to."""
+    'loop_closure.covariance_scale': lambda draw: draw.uniform(0.5, 2.0),
+    'transform_slew': lambda draw: draw.choice(([0.0, 0.0], [0.5, 0.2]))}
+"""What may change while the node runs, and what to; what is wrong stays judged."""
 
 
 @dataclass(slots=True)
@@ -118,7 +118,7 @@ class Robot:
         self.known = deque[tuple[float, int]](maxlen=100)   # when there were how many nodes
         self._under_way: dict[int, float] = {}  # when odometry was sent, by its stamp
         self.latencies, self.flows, self.newest = list[float](), False, None
-        self.logs = list[Path]()
+        self.logs, self.fixed_ns = list[Path](), 0
         self.start()
 
     def connect(self) -> None:
@@ -190,6 +190,8 @@ class Robot:
     def say(self, event: Event) -> None:
         """Send what a sensor says; odometry once few messages are under way."""
         source, measurement = event
+        if source == 'fix':
+            self.fixed_ns = measurement.stamp_ns
         self.send(source, message_of(measurement))
         if not isinstance(measurement, OdometrySample) or math.isnan(measurement.pose[0]):
             return
@@ -358,8 +360,10 @@ class Soak:
             if self.errors[-1] > FAR:
                 told = {name: robot.values.get(name, '') for name in (
                     'hidden_nodes', 'alignment_sigma_deg', 'fix.accepted', 'fix.doubted')}
-                self.far.append(f'{self.errors[-1]:.1f} m, {sent} messages after {self._last}, '
-                                f'covariance {robot.newest.pose.covariance[0]:.3g}, {told}')
+                without = (stamp_ns(robot.newest) - robot.fixed_ns) / 1_000_000_000
+                sigma = math.sqrt(robot.newest.pose.covariance[0])
+                self.far.append(f'{self.errors[-1]:.1f} m (sigma {sigma:.1f} m), {sent} messages '
+                                f'after {self._last}, {without:.0f} s after a fix, {told}')
         robot.stop_flowing()
 
     # ---- disturbances
@@ -440,7 +444,8 @@ class Soak:
             robot.unanswered, *ms.tolist(), len(lines),
             sum('[ERROR]' in line or 'Traceback' in line for line in lines), self.crashes,
             self.stuck[-20:], dict(self.actions), self.refused, self.missing,
-            float(np.median(errors or [math.nan])), max(errors, default=math.nan), self.far[-20:],
+            float(np.median(errors or [math.nan])), max(errors, default=math.nan),
+            self.far[-20:],
             int(robot.values.get('hidden_nodes', 0)), float(robot.values.get(
                 'journal.size_mb', 'nan')), float(robot.values.get('journal.lag_max_s', 'nan')))
 

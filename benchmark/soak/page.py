@@ -20,12 +20,14 @@ from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, ORANGE, SKY, STYLE, VE
 ENGINE, NODE, PICTURE = 'engine.jsonl', 'node.jsonl', 'soak.png'
 Row = dict[str, Any]
 ENGINE_COLUMNS = {
-    'hour': 'hours', 'resident MB': 'resident', 'nodes of the path': 'nodes',
+    'hour': 'hours', 'resident MB': 'resident', 'engine MB': 'held',
+    'nodes of the path': 'nodes',
     'in the graph': 'kept', 'update mean ms': 'update_mean', 'p99': 'update_p99',
     'max': 'update_max', 'cliques': 'update_work', 'copy of the path ms': 'path',
     'copy of the state ms': 'checkpoint', 'journal MB': 'journal', 'restarts': 'kills',
     'recovery s': 'recovery', 'newest rms m': 'rms', 'path rms m': 'path_rms',
-    'without answer': 'lost', 'refused, not meant': 'unexpected'}
+    'without answer': 'lost',
+    'another answer after a restart': 'forgotten', 'refused, not meant': 'unexpected'}
 NODE_COLUMNS = {
     'minute': 'minutes', 'resident MB': 'resident', 'its age min': 'age', 'sent': 'sent',
     'not received': 'lost', 'poses': 'poses', 'without a pose': 'unanswered',
@@ -80,7 +82,8 @@ def draw(engine: Sequence[Row], node: Sequence[Row], file: Path) -> None:
         figure = Figure(figsize=(16.0, 8.5), dpi=100, layout='constrained')
         above, below = figure.subplots(2, 4)
         _panels(above, engine, 'hours', 'hours of work', (
-            ('resident memory [MB]', {'of the process': ('resident', BLUE)}, False),
+            ('resident memory [MB]', {'of the process': ('resident', BLUE), 'of it the engine': (
+                'held', SKY)}, False),
             ('time of an update [ms]', {'mean': ('update_mean', BLUE), 'p99': (
                 'update_p99', SKY), 'max': ('update_max', GREY)}, True),
             ('journal [MB], recovery [s]', {'largest file': ('journal', BLUE), 'last recovery': (
