@@ -77,7 +77,7 @@ class Robot:
 
     def _open(self) -> PoseGraphBackend:
         self.journal = Journal(self._folder / 'state.db', 1.0)
-        found = self.journal.found.result()
+        found = self.journal.take()
         self.chapter = self.journal.begin()
         if found.trouble != '' or self.journal.failure != '':
             raise RuntimeError(f'{found.trouble} {self.journal.failure}')

@@ -36,7 +36,7 @@ def journal_of(values: Mapping[str, Any]) -> Journal | None:
 
 def from_journal(journal: Journal, config: BackendConfig, datum: Datum) -> PoseGraphBackend | None:
     """Return an engine that continues what a journal holds, with its datum; None if nothing."""
-    found = journal.found.result()
+    found = journal.take()
     state, n = found.state, sum(entry.act == 0 for entry in found.entries)
     if found.last == (0, 0):
         logger.info('the journal is empty: starting with an empty graph')

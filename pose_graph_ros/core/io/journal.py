@@ -88,7 +88,7 @@ Item = tuple[float, Chapter, Any, threading.Event]
 
 class Journal:
     """
-    Writes a journal; `found` is what the file held.
+    Writes a journal; `take` returns what the file held.
 
     What is handed over is on the disk after `period` [s], if the disk is not slower; `lag` is the
     longest time that it took. If the file cannot be written, `failure` says why; from then on
@@ -98,7 +98,7 @@ class Journal:
 
     def __init__(self, path: Path, period: float,
                  refusal: Callable[[SavedGraph], str | None] = lambda _: None) -> None:
-        self.found = Future[Found]()
+        self._found = Future[Found]()
         self.failure, self.lag, self.has_gap = '', 0.0, False
         self._file, self._period, self._refusal = JournalFile(path), period, refusal
         self._items = deque[Item]()
@@ -108,6 +108,11 @@ class Journal:
         self._n_chapters, self._chapter = 0, Chapter(self, 0)
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
+
+    def take(self) -> Found:
+        """Return what the file held, once it is read; only the first call does."""
+        found, self._found = self._found.result(), Future()
+        return found
 
     def begin(self, *, has_state: bool = False) -> Chapter:
         """
@@ -156,7 +161,9 @@ class Journal:
             found = self._file.read(self._refusal)
         except Exception as error:
             self._fail(error)
-        self.found.set_result(found)
+        self._found.set_result(found)
+        last = found.last
+        del found
         while True:
             with self._condition:
                 self._condition.wait_for(
@@ -164,7 +171,7 @@ class Journal:
                 closing, self._is_wanted = self._closing, False
             items = [self._items.popleft() for _ in range(len(self._items))]
             try:
-                self._write(self._batch(items, found))
+                self._write(self._batch(items, last))
             except Exception as error:
                 self._fail(error)
             else:
@@ -176,7 +183,7 @@ class Journal:
                 self._file.close()
                 return
 
-    def _batch(self, items: Sequence[Item], found: Found) -> Batch:
+    def _batch(self, items: Sequence[Item], found: tuple[int, int]) -> Batch:
         batch = Batch()
         for k, (_, chapter, item, _) in enumerate(items):
             if chapter.number < self._chapter.number:
@@ -191,8 +198,8 @@ class Journal:
                 self._chapter = chapter
                 if chapter.number > 1:
                     batch = Batch(cleared=True)
-                elif found.last > (0, 0):
-                    chapter.base = found.last[0], found.last[1] + 1
+                elif found > (0, 0):
+                    chapter.base = found[0], found[1] + 1
                     batch.entries.append(Entry(*chapter.base, 'resume', []))
                 continue
             number, act = chapter.base

@@ -37,7 +37,7 @@ class Drive:
     def __init__(self, folder: Path, config: BackendConfig) -> None:
         self.config, self.path = config, folder / 'state.db'
         self.journal = Journal(self.path, PERIOD)
-        found = self.journal.found.result()
+        found = self.journal.take()
         self.chapter = self.journal.begin()
         self.backend = recovered(config, found, no_place)
         self.found = found
