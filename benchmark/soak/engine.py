@@ -110,10 +110,11 @@ class Robot:
 
     def keep_state(self) -> float:
         """Let the journal have the state; return how long it took to copy it [s]."""
+        self.chapter.begin_checkpoint()
         begin = time.thread_time()
         saved = self.backend.saved(self._datum.plane.origin if self._datum.plane else None)
         taken = time.thread_time() - begin
-        self.chapter.checkpoint(saved, self.backend.pending, taken)
+        self.chapter.checkpoint(saved, self.backend.pending)
         self.checkpointed = Counter(self.backend.counts)
         return taken
 

@@ -42,6 +42,7 @@ from pose_graph_ros.ros.worker import SetPoseInput, Worker
 logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
+JOURNAL_TIMEOUT = 2.0  # the same for the disk [s]
 
 
 class Replaced(NamedTuple):
@@ -181,7 +182,7 @@ class Session:
         if not self.worker.stop(STOP_TIMEOUT):
             logger.warning('stopping in the middle of %s',
                            'a compilation' if self.compiling else 'a solve')
-        if self.journal is not None and not self.journal.close(STOP_TIMEOUT):
+        if self.journal is not None and not self.journal.close(JOURNAL_TIMEOUT):
             logger.warning('the journal is still being written')
         self.out.close()
 

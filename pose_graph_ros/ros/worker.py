@@ -311,9 +311,8 @@ class Worker:
     def keep_state(self, datum: geodesy.MapOrigin | None) -> None:
         """Let the journal have the state of the engine, in this thread."""
         if (chapter := self.chapter) is not None and len(self._backend.node_stamps_ns) > 0:
-            begin = time.monotonic()
-            saved = self._backend.saved(datum)
-            chapter.checkpoint(saved, self._backend.pending, time.monotonic() - begin)
+            chapter.begin_checkpoint()
+            chapter.checkpoint(self._backend.saved(datum), self._backend.pending)
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
         """Log and count an error; one of this project tells users why, and needs no traceback."""

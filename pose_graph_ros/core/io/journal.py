@@ -74,10 +74,13 @@ class Chapter:
         return self._is_changed and (
             idle > IDLE or waited > LEAST) and waited > SHARE * self._cost
 
-    def checkpoint(self, saved: SavedGraph, pending: Sequence[tuple[str, Measured]],
-                   cost: float) -> None:
-        """Note the state of the engine now, which it took a time to copy [s]."""
-        self._is_changed, self._cost, self._checked_at = False, cost, time.monotonic()
+    def begin_checkpoint(self) -> None:
+        """Begin to copy the state: the next one is not due soon, also if this one fails."""
+        self._checked_at = time.monotonic()
+
+    def checkpoint(self, saved: SavedGraph, pending: Sequence[tuple[str, Measured]]) -> None:
+        """Note the state of the engine, in whose thread it was copied."""
+        self._is_changed, self._cost = False, time.monotonic() - self._checked_at
         self._journal.put(self, Checkpoint(
             saved, [(source, plain(each)) for source, each in pending], (self.taken, self._acts)))
 

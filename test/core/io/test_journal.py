@@ -52,7 +52,7 @@ class Drive:
         self.backend.update()
 
     def checkpoint(self) -> None:
-        self.chapter.checkpoint(self.backend.saved(), self.backend.pending, 0.0)
+        self.chapter.checkpoint(self.backend.saved(), self.backend.pending)
 
     def keep_path(self) -> None:
         self.chapter.keep_path(path_of(self.backend))
