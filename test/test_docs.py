@@ -129,3 +129,9 @@ def test_what_users_call_has_a_docstring() -> None:
     # (a dataclass that has none gets its signature)
     assert not [one for one in named
                 if not one.__doc__ or one.__doc__.startswith(f'{one.__name__}(')]
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_tests_that_a_page_names_exist(page: Path) -> None:
+    for file, name in re.findall(r'`(test/[\w/]+\.py)::(\w+)`', page.read_text(encoding='utf-8')):
+        assert f'\ndef {name}(' in (ROOT / file).read_text(encoding='utf-8'), f'{file}::{name}'
