@@ -48,6 +48,7 @@ DATUM = 48.1, 11.6
 PARAMETERS = (f'datum:=[{DATUM[0]}, {DATUM[1]}]', 'window.nodes:=2000.0',
               'diagnostics_period:=0.5')
 UNDER_WAY = 20  # messages of odometry without a pose so far
+BEHIND = 1000   # messages that the node has received and the engine has not taken
 PATIENCE = 60.0     # longest wait for the node [s]
 SILENCE = 2.0   # longest wait for a pose; those that are late count as unanswered [s]
 EPOCH = 4.0, 20.0   # time between two disturbances [s]
@@ -199,11 +200,18 @@ class Robot:
             time.sleep(0.02)    # until there is an estimate no pose is published
             return
         self._under_way[measurement.stamp_ns] = begin = time.monotonic()
+        while self.behind > BEHIND and time.monotonic() < begin + 10.0:
+            time.sleep(0.01)
         while len(self._under_way) > UNDER_WAY:
             time.sleep(0.0005)
             if time.monotonic() - begin > SILENCE:
                 self.unanswered += len(self._under_way)
                 self.stop_flowing()
+
+    @property
+    def behind(self) -> int:
+        """Number of messages that the engine has not taken, by the newest diagnostics."""
+        return int(self.values.get('received', 0)) - int(self.values.get('processed', 0))
 
     def stop_flowing(self) -> None:
         """Expect no pose until one comes."""
@@ -349,6 +357,9 @@ class Soak:
     def _end_epoch(self) -> None:
         """Compare what was sent and received, and the pose with the truth."""
         robot = self.robot
+        robot.wait_quiet()
+        for event in itertools.islice(self._events, 5):
+            robot.say(event)    # a pose by an estimate that has all
         robot.wait_quiet()
         received, sent = int(robot.values['received']) - self._from, robot.sent - self._sent
         self.received, self.lost = self.received + received, self.lost + sent - received
