@@ -15,9 +15,11 @@ import numpy as np
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.io.journal_file import Entry, Found, KnownPath, measurement_of, Place
 from pose_graph_ros.core.judgement.verdicts import Decision
+from pose_graph_ros.core.saved_columns import MISMATCHES
 
 logger = logging.getLogger(__name__)
 
@@ -27,14 +29,17 @@ def recovered(config: BackendConfig, found: Found, place: Place) -> PoseGraphBac
     Return an engine that continues where the journal ends.
 
     `place` returns the position in the map of a latitude, longitude and altitude. What cannot be
-    done again is logged and left out.
+    done again is logged and left out. Raises FileFormatError where the state does not fit.
     """
     if found.state is None:
         backend = PoseGraphBackend(config)
     else:
         backend = PoseGraphBackend.restored(config, found.state.saved)
-        backend.take_pending((source, measurement_of(values, place))
-                             for source, values in found.state.pending)
+        try:
+            backend.take_pending((source, measurement_of(values, place))
+                                 for source, values in found.state.pending)
+        except MISMATCHES as error:
+            raise FileFormatError(f'what waited cannot be read: {error!r}') from error
     n_failed = 0
     for entry in found.entries:
         try:
