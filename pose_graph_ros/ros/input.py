@@ -212,9 +212,9 @@ class Senders:
         self._known.clear()
         self._noted_at.clear()
 
-    def have_changed(self, source: str) -> bool:
-        """Tell whether all that are known have gone, and there are others."""
-        if (known := self._known.get(source)) is None:
+    def have_changed(self, source: str, is_new: bool) -> bool:
+        """Tell whether all that are known have gone, and there are others; or have hardly come."""
+        if (known := self._known.get(source)) is None or (is_new and self.strangers_may):
             return self.strangers_may
         found = self._find(source)
         return len(known) > 0 and len(found) > 0 and known.isdisjoint(found)

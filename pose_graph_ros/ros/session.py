@@ -42,6 +42,7 @@ from pose_graph_ros.ros.worker import SetPoseInput, Worker
 logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
+NEW_GRAPH = 'a new graph was started: '
 JOURNAL_TIMEOUT = 2.0  # the same for the disk [s]
 
 
@@ -287,10 +288,11 @@ class Session:
     def reset(self) -> None:
         """Start a new graph on request; the next messages may have any stamps."""
         self.input.time_jumps.forget()
+        why = 'a call of ~/reset'
         if self.is_loaded or any(each.count > 0 for each in self.input.arrivals.values()):
-            self._start_new_graph('a call of ~/reset')
+            self._start_new_graph(why)
         else:   # nothing has come since the last one
-            self.n_resets += 1
+            self.n_resets, self.reset_reason = self.n_resets + 1, f'{NEW_GRAPH}{why}'
 
     def _publishers(self, source: str) -> set[bytes]:
         """Return the ids of those who publish the topic of a source."""
@@ -299,7 +301,7 @@ class Session:
 
     def _start_new_graph(self, reason: str, messages: Sequence[ReceivedMessage] = ()) -> None:
         """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
-        self._replace(PoseGraphBackend(self._config), f'a new graph was started: {reason}')
+        self._replace(PoseGraphBackend(self._config), f'{NEW_GRAPH}{reason}')
         for source, message, *_ in messages:
             self.input.arrivals[source].count += 1
             # read again, as the first fix of the new graph may be its datum

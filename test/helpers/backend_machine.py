@@ -165,7 +165,8 @@ class Histories(RuleBasedStateMachine):
         return (self.closure(tick, off), *(
             ('fix', ms.Position(stamp, where, cov[:2, :2], np.array(lever_arm)))
             for lever_arm in ((0.0, 0.0), (0.5, -0.2))),
-            ('earth', ms.Fix(stamp, where.copy, cov[:2, :2], np.zeros(2))),
+            ('earth', ms.Fix(stamp, (0.0, 0.0, 0.0), lambda *_: where.copy(), cov[:2, :2],
+                              np.zeros(2))),
             ('pose', ms.GlobalPose(stamp, pose, cov)),
             ('compass', ms.HeadingOnly(stamp, float(pose[2]), 0.01)),
             ('gyro', ms.YawRate(self.stamp(tick), float(rng.normal(0.05, 0.01)), 1e-4)),

@@ -41,7 +41,7 @@ def assert_short(text: str) -> None:
 
 @pytest.mark.parametrize('field', ['frame_id', 'child_frame_id'])
 def test_a_message_with_an_endless_name_is_refused_and_not_kept(field: str) -> None:
-    received, message = Input(checked({})), harness.odometry(5.0, 0.0, 0.0, 0.0)
+    received, message = Input(checked({}), lambda _: ()), harness.odometry(5.0, 0.0, 0.0, 0.0)
     setattr(message.header if field == 'frame_id' else message, field, MEGABYTE)
     assert received.receive('odom', message).released == []
     assert received.rejected == {('odom', 'long_name'): 1}

@@ -39,7 +39,7 @@ RETRY = 5.0     # time after which a file that could not be written is tried aga
 # times as long as the last one took [s].
 LEAST, SHARE = 10.0, 50.0
 IDLE = 1.0      # time without a measurement after which a checkpoint costs nobody anything [s]
-LONGEST_WAIT = 0.5  # of a path for the disk [s]
+LONGEST_WAIT = 1.0  # of a path for the disk [s]
 
 
 class Chapter:

@@ -63,8 +63,9 @@ class TimeKeeper:
 
     def __init__(self, odometry: list[str], threshold_ns: StampNs) -> None:
         self.threshold_ns = threshold_ns
-        # tells whether time may begin again with a source; a recording cannot tell
-        self.may_begin_again: Callable[[str], bool] = lambda _: True
+        # tells whether time may begin again with a source, and if the present has hardly begun;
+        # a recording cannot tell
+        self.may_begin_again: Callable[[str, bool], bool] = lambda *_: True
         self._odometry = list(odometry)
         self._watches = defaultdict[str, _Watch](_Watch)
         self._since_ns = 0
@@ -135,9 +136,8 @@ class TimeKeeper:
         if is_evidence and not decides and 2 * (others_ns - watch.others_ns) > lasts_ns:
             watch.newest_ns = 0
         begins_again, can_decide = stamp_ns < earliest_ns, decides or watch.newest_ns > 0
-        # what has gone on for less than a second is hardly a present
-        watch.in_doubt = begins_again and can_decide and (
-            now_ns - self._since_ns < EVIDENCE_NS or self.may_begin_again(source))
+        watch.in_doubt = begins_again and can_decide and self.may_begin_again(
+            source, now_ns - self._since_ns < EVIDENCE_NS)
         if begins_again and can_decide and not watch.in_doubt:
             return Judgement(self._refusal(source, stamp_ns))
         if is_evidence and can_decide:

@@ -55,7 +55,8 @@ class Drive:
         self.chapter.checkpoint(self.backend.saved(), self.backend.pending)
 
     def keep_path(self) -> None:
-        self.chapter.keep_path(path_of(self.backend))
+        """Let the journal have the path, and wait until it is on the disk, however busy."""
+        assert self.journal.put(self.chapter, path_of(self.backend), at_once=True).wait(60.0)
 
     def killed(self) -> 'Drive':
         """Return the drive that goes on with what is on the disk now."""

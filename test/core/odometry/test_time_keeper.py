@@ -63,7 +63,7 @@ def test_time_begins_again_once_stamps_behind_go_on_for_a_second(away: float) ->
 @pytest.mark.parametrize('away', [-2.0, -3600.0])
 def test_time_does_not_begin_again_where_it_may_not(away: float) -> None:
     one, asked = Given(), []
-    one.keeper.may_begin_again = lambda source: asked.append(source) or len(asked) > 50
+    one.keeper.may_begin_again = lambda source, _: asked.append(source) or len(asked) > 50
     stamps = [NOW + away + 0.1 * step for step in range(100)]
     assert one.answers(*stamps[:5]) == {'refused'}
     assert one.goes_on()
@@ -74,7 +74,7 @@ def test_time_does_not_begin_again_where_it_may_not(away: float) -> None:
 
 def test_first_stamps_that_are_far_ahead_hold_nobody_up() -> None:
     one = Given(began=False)
-    one.keeper.may_begin_again = lambda _: False
+    one.keeper.may_begin_again = lambda _, is_new: is_new
     assert one.answers(NOW + 4e8, NOW + 4e8 + 0.1) == {'used'}
     answers = [one.send(NOW + 0.1 * step) for step in range(50)]
     assert answers == 10 * ['refused'] + ['again'] + 39 * ['used']

@@ -13,6 +13,7 @@ from pose_graph_ros.core.measurements import Fix, HeadingOnly, OdometrySample, P
 from pose_graph_ros.core.sources import pipeline
 from pose_graph_ros.core.sources.settings import SOURCES
 
+NOWHERE = 0.0, 0.0, 0.0
 SECOND = 1_000_000_000
 
 
@@ -78,10 +79,10 @@ def test_a_fix_is_placed_when_it_is_attached_and_not_if_it_is_refused(
     asked: list[float] = []
 
     def fix(seconds: float, variances: np.ndarray) -> Fix:
-        def place() -> np.ndarray:
+        def place(*_: float) -> np.ndarray:
             asked.append(seconds)
             return np.array((seconds, 0.0))
-        return Fix(round(seconds * SECOND), place, variances, np.zeros(2))
+        return Fix(round(seconds * SECOND), NOWHERE, place, variances, np.zeros(2))
 
     for k in range(1, 100):
         backend.add_odometry(OdometrySample(k * SECOND // 10 + SECOND, np.array((0.1 * k, 0, 0))))
@@ -103,5 +104,5 @@ def test_a_fix_too_far_from_the_datum_is_refused() -> None:
     for k in range(1, 100):
         backend.add_odometry(OdometrySample(k * SECOND // 10, np.array((0.1 * k, 0, 0))))
     for place, reason in ((np.array((2e9, 0.0)), 'too_large'), (np.full(2, np.nan), 'not_finite')):
-        fix = Fix(5 * SECOND, lambda place=place: place, np.eye(2), np.zeros(2))
+        fix = Fix(5 * SECOND, NOWHERE, lambda *_, place=place: place, np.eye(2), np.zeros(2))
         assert backend.add_measurement(fix, 'fix').reason == reason
