@@ -195,6 +195,7 @@ class Worker:
     def _run(self) -> None:
         try:
             self._backend = self._prepare(lambda: self._stopping) or self._backend
+            self.prepared = True
             if not self._stopping:
                 # before anything is solved again, what was there before
                 self._publish()

@@ -241,7 +241,7 @@ class Histories(RuleBasedStateMachine):
     def refine(self, n: int, interrupted: bool) -> None:
         for _ in range(n):
             if interrupted:
-                self.backend.interrupt_refinement()
+                self.backend.interrupt()
             self.backend.refine()
 
     @rule()
