@@ -9,6 +9,7 @@ Whatever the bytes, only errors of this package may come of them, each with a me
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
+from copy import deepcopy
 import hashlib
 import json
 from pathlib import Path
@@ -116,7 +117,7 @@ class Saved:
             if value is DROP:
                 del owner[name]
             else:
-                owner[name] = value
+                owner[name] = deepcopy(value)   # later edits may be of what it has
         return json.dumps(root)[1:].encode()
 
 
