@@ -289,14 +289,14 @@ def _found(path: Path) -> Found:
     n_commits = _n_commits(_files(path)[1])
     try:
         connection, _ = _connected(path)
-    except (sqlite3.Error, FileFormatError) as error:
+    except (sqlite3.Error, ValueError) as error:    # its texts may be no UTF-8
         return Found(trouble=f'it is damaged, or no journal: {error}')
     with contextlib.closing(connection):
         try:
             found = _read(connection)
             # what is behind a bad frame of the log is for SQLite a commit that was not ended
             _, n_whole, _ = connection.execute('PRAGMA wal_checkpoint(PASSIVE)').fetchone()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, ValueError) as error:
             return Found(trouble=f'it is damaged: {error}')
     return found if found.trouble != '' or n_whole >= n_commits else found._replace(
         trouble=f'its newest part is damaged: of {n_commits} pages {n_whole} are whole')
