@@ -19,9 +19,6 @@ from threading import enumerate as all_threads, Thread
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit code."""
-    # else each wait for the interpreter takes 5 ms while another thread calculates, and a message
-    # of odometry has several of them
-    sys.setswitchinterval(5e-4)
     ends, end = os.pipe()   # a byte for each signal, and one if the callbacks end by themselves
     os.set_blocking(end, False)
     signal.set_wakeup_fd(end)
