@@ -112,14 +112,15 @@ class Robot:
         """Let the journal have the state; return how long it took to copy it [s]."""
         self.chapter.begin_checkpoint()
         begin = time.thread_time()
-        saved = self.backend.saved(self._datum.plane.origin if self._datum.plane else None)
+        saved = self.backend.saved(
+            self._datum.plane.origin if self._datum.plane else None, texts=False)
         taken = time.thread_time() - begin
         self.chapter.checkpoint(saved, self.backend.pending)
         self.checkpointed = Counter(self.backend.counts)
         return taken
 
     def _wait(self, path: KnownPath) -> None:
-        if not self.journal.put(self.chapter, path, at_once=True).wait(PATIENCE):
+        if not self.journal.put_at_once(self.chapter, path).wait(PATIENCE):
             raise TimeoutError('the journal does not write')
 
     def kill(self) -> None:

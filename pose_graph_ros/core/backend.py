@@ -415,10 +415,11 @@ class PoseGraphBackend:
         """Return those at the path of the present estimate; see `core.parts`."""
         return parts.path_covariances(self.parts, estimate)
 
-    def saved(self, datum: geodesy.MapOrigin | None = None) -> SavedGraph:
+    def saved(self, datum: geodesy.MapOrigin | None = None, *, texts: bool = True) -> SavedGraph:
         """Return the graph with its state since the last update; see `parts.capture`."""
         self._tuner.finish_change()
-        return parts.capture(self.parts, self._newest_node_covariance, self._chi2, datum)
+        return parts.capture(
+            self.parts, self._newest_node_covariance, self._chi2, datum, texts=texts)
 
     @classmethod
     def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:

@@ -63,12 +63,13 @@ class Parts(NamedTuple):
     smoother: IncrementalSmoother
 
 
-def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None) -> SavedGraph:
+def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None, *,
+            texts: bool) -> SavedGraph:
     """
     Return the state of an engine as a value; NothingToSaveError if there is no hidden node.
 
     Measurements that wait for odometry are left out and do not count as seen. The covariance is
-    that of the newest hidden node, in map axes.
+    that of the newest hidden node, in map axes. The texts are those of verdicts, for people.
     """
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
@@ -79,8 +80,9 @@ def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None)
         seen=pipeline.seen.saved(left_out), losses=deepcopy(parts.reweighting),
         alignment=parts.alignment.saved(), waiting=tuple(pipeline.queue),
         set_aside=tuple(parts.quarantine), judgement=parts.judge.saved(),
-        verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
-                  if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
+        verdicts={} if not texts else {
+            each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
+            if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
         newest_covariance=cov.copy(), chi2=chi2, n_left_out=len(left_out),
         datum=datum, beacons=dict(pipeline.beacons.ids),
         gyros={name: gyro.saved() for name, gyro in pipeline.gyros.streams.items()})

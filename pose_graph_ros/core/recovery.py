@@ -77,7 +77,7 @@ def _again(backend: PoseGraphBackend, config: BackendConfig, path: KnownPath) ->
     """Return an engine like one, with another path, whose odometry may have another origin."""
     if len(backend.node_stamps_ns) == 0:
         return backend
-    again = PoseGraphBackend.restored(config, _on(backend.saved(), path))
+    again = PoseGraphBackend.restored(config, _on(backend.saved(texts=False), path))
     again.take_pending(backend.pending)
     again.counts.update(backend.counts)
     return again

@@ -89,13 +89,16 @@ class Session:
             self._warm_up(stopped)
             backend = None if journal is None or stopped() else from_journal(
                 journal, self._config, self.input.reader.datum)
-            return backend if backend is not None or path is None or stopped() else continued(
-                path, values['file_folder'], self._config)
+            if backend is None and path is not None and not stopped():
+                backend = continued(path, values['file_folder'], self._config)
+            if backend is None and not stopped():
+                self._set_loaded(is_loaded=False)
+            return backend
 
-        self._begin(PoseGraphBackend(self._config), prepare,
-                    resumes=journal is not None or path is not None)
         if datum is not None:
             self.input.reader.datum.keep(datum)
+        self._begin(PoseGraphBackend(self._config), prepare,
+                    resumes=journal is not None or path is not None)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         self._set_timer('watchdog', 0.2, lambda: self.worker.watchdog.watch(
             self.values['solve_timeout']))
@@ -105,8 +108,7 @@ class Session:
         """Start the thread that owns a graph, which may resume a drive."""
         self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
                             for name, source in self._config.odometry.items()}
-        self.is_loaded = resumes  # whether the graph began as one that was loaded
-        self.input.time_jumps.senders.strangers_may = not resumes
+        self._set_loaded(is_loaded=resumes)
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()
         graph = self.out.graph
@@ -117,6 +119,11 @@ class Session:
         if resumes:
             self._keep_state()
             self.worker.request_update()
+
+    def _set_loaded(self, *, is_loaded: bool) -> None:
+        """Note whether the graph began as one that was loaded, which odometry must not take."""
+        self.is_loaded = is_loaded
+        self.input.time_jumps.senders.strangers_may = not is_loaded
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""

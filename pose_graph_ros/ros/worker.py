@@ -313,7 +313,7 @@ class Worker:
         """Let the journal have the state of the engine, in this thread."""
         if (chapter := self.chapter) is not None and len(self._backend.node_stamps_ns) > 0:
             chapter.begin_checkpoint()
-            chapter.checkpoint(self._backend.saved(datum), self._backend.pending)
+            chapter.checkpoint(self._backend.saved(datum, texts=False), self._backend.pending)
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
         """Log and count an error; one of this project tells users why, and needs no traceback."""

@@ -64,7 +64,7 @@ class Chapter:
 
     def keep_path(self, path: KnownPath) -> None:
         """Note the path that is about to be published; wait, not for long, until it is safe."""
-        self._journal.put(self, path, at_once=True).wait(LONGEST_WAIT)
+        self._journal.put_at_once(self, path).wait(LONGEST_WAIT)
 
     def is_due(self, idle: float) -> bool:
         """Tell whether a checkpoint is due, given how long ago the newest measurement came [s]."""
@@ -85,8 +85,8 @@ class Chapter:
             saved, [(source, plain(each)) for source, each in pending], (self.taken, self._acts)))
 
 
-Item = tuple[float, Chapter, Any, threading.Event]
-"""When something was handed over [s], by whom, what, and what says that it was written."""
+Item = tuple[float, Chapter, Any, threading.Event | None]
+"""When something was handed over [s], by whom, what, and what to set once it is written."""
 
 
 class Journal:
@@ -129,14 +129,17 @@ class Journal:
         self.put(chapter, None)
         return chapter
 
-    def put(self, chapter: Chapter, item: object, *, at_once: bool = False) -> threading.Event:
-        """Hand something over to be written; return the event that it is."""
+    def put(self, chapter: Chapter, item: object) -> None:
+        """Hand something over to be written within the period."""
+        self._items.append((time.monotonic(), chapter, item, None))
+
+    def put_at_once(self, chapter: Chapter, item: object) -> threading.Event:
+        """Hand something over to be written now; return the event that it is."""
         event = threading.Event()
         self._items.append((time.monotonic(), chapter, item, event))
-        if at_once:
-            with self._condition:
-                self._is_wanted = True
-                self._condition.notify()
+        with self._condition:
+            self._is_wanted = True
+            self._condition.notify()
         return event
 
     def set_aside(self, why: str) -> None:
@@ -181,7 +184,8 @@ class Journal:
                 if len(items) > 0 and not self.has_gap:
                     self.lag = max(self.lag, time.monotonic() - items[0][0])
             for *_, event in items:
-                event.set()
+                if event is not None:
+                    event.set()
             if closing:
                 self._file.close()
                 return

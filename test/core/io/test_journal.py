@@ -56,7 +56,7 @@ class Drive:
 
     def keep_path(self) -> None:
         """Let the journal have the path, and wait until it is on the disk, however busy."""
-        assert self.journal.put(self.chapter, path_of(self.backend), at_once=True).wait(60.0)
+        assert self.journal.put_at_once(self.chapter, path_of(self.backend)).wait(60.0)
 
     def killed(self) -> 'Drive':
         """Return the drive that goes on with what is on the disk now."""
