@@ -71,7 +71,7 @@ class Process:
 
     def n_lines(self) -> int:
         """Return how many lines its log has."""
-        return self._log.read_bytes().count(b'\n')
+        return self.log.read_bytes().count(b'\n')
 
     def cpu_seconds(self) -> float:
         """Return the time of the processor that it has taken so far [s]."""
