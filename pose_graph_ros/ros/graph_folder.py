@@ -15,16 +15,20 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.io.graph_files import graph_paths
 from pose_graph_ros.core.judgement.texts import shortened
 
+MOST_BYTES = 4000  # of a name with its folders: Linux takes 4095 of a path
+
 
 def graph_path(values: Mapping[str, Any]) -> Path:
     """Return the file that graph_file names below file_folder; raises `ConfigError` for none."""
     name, folder = values['graph_file'], Path(values['file_folder'])
     expected = f'expected the name of a file below {folder}, the file_folder, such as map.g2o'
     try:
-        path = folder / Path(name).expanduser()
+        # before anything that takes longer with each part of it
+        is_short = '\0' not in name and len(os.fsencode(name)) <= MOST_BYTES
+        path = folder / Path(name if is_short else '').expanduser()
         files = graph_paths(path)
-        if '\0' in name or any(len(os.fsencode(each)) > 255 for each in files[1].parts):
-            expected = 'expected names of at most 255 bytes without NUL'
+        if not is_short or any(len(os.fsencode(each)) > 255 for each in files[1].parts):
+            expected = f'expected names of at most 255 bytes without NUL, {MOST_BYTES} in all'
         # a link may lead anywhere
         elif name != '' and all(each.resolve().is_relative_to(folder) for each in files):
             return path.parent.resolve() / path.name

@@ -14,7 +14,7 @@ import os
 import select
 import signal
 import sys
-from threading import enumerate as all_threads, Thread
+from threading import Thread
 
 
 def main(args: list[str] | None = None) -> int:
@@ -34,7 +34,6 @@ def main(args: list[str] | None = None) -> int:
     from pose_graph_ros.core.exceptions import ConfigError, NumbaVersionError
     try:
         from pose_graph_ros.ros.node import PoseGraphNode
-        from pose_graph_ros.ros.services import SERVICE_THREAD
         from pose_graph_ros.ros.spinning import Spinner
     except NumbaVersionError as error:
         print(f'pose_graph_node: {error}', file=sys.stderr)
@@ -66,9 +65,6 @@ def main(args: list[str] | None = None) -> int:
     spinner.stop()
     thread.join(0.5)    # for a callback [s]
     node.close()
-    for each in all_threads():
-        if each.name == SERVICE_THREAD:
-            each.join(1.0)  # for files of the graph that are written [s]
     spinner.close()
     node.destroy_node()
     rclpy.try_shutdown()

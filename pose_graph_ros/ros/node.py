@@ -12,6 +12,7 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.qos import qos_profile_services_default
 
 from pose_graph_ros.adapters import parameters as rules
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
@@ -44,6 +45,7 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''  # why the last transition failed
         self._session: session.Session | None = None
         self._offered: services.Services | None = None
+        self._service_thread: services.ServiceThread | None = None
         # the node's own parameters that have a value
         self._given = with_folder(self._declare(PARAMETERS))
         for source in rules.listed_sources(self._given):
@@ -63,6 +65,8 @@ class PoseGraphNode(LifecycleNode):
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
+        if self._service_thread is not None:
+            self._service_thread.close(1.0)     # for files of the graph that are written
         self._log.close()
         super().destroy_node()
 
@@ -128,7 +132,9 @@ class PoseGraphNode(LifecycleNode):
         values = rules.checked_together(self._given)
         topics.check_topics(self, values, self._overrides)
         self._session = session.Session(self, values)
-        self._offered = services.Services(self, self._session)
+        if self._service_thread is None:
+            self._service_thread = services.ServiceThread(self)
+        self._offered = services.Services(self, self._session, self._service_thread)
 
     def close(self) -> None:
         """Stop the worker and destroy all that was configured."""
@@ -139,6 +145,11 @@ class PoseGraphNode(LifecycleNode):
                 each.close()
 
     # ---- parameters
+
+    def create_service(self, *arguments: Any, **options: Any) -> Any:
+        """Create a service; of requests that wait, also on parameters, the newest ten are kept."""
+        return super().create_service(
+            *arguments, **{**options, 'qos_profile': qos_profile_services_default})
 
     def declare_parameters(self, namespace: str, parameters: Any,
                            ignore_override: bool = False) -> list[RosParameter]:

@@ -7,7 +7,7 @@ Those that wait, for the worker or for files, are served by a thread and a hidde
 own, so that neither odometry nor transforms wait for them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 import logging
 from pathlib import Path
@@ -15,6 +15,7 @@ from threading import Thread
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.service import Service
 from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.adapters.sources import backend_config
@@ -32,35 +33,59 @@ logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
-SERVICE_THREAD, HIDDEN_NODE = 'pose graph services', '_services'
+HIDDEN_NODE = '_services'
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
+
+
+class ServiceThread:
+    """
+    A hidden node and its thread, for services that wait.
+
+    There is one as long as there is a process: rclpy gives back little of what a node takes.
+    """
+
+    def __init__(self, node: Node) -> None:
+        # it is within the node's own name, and none of the arguments that rename that are for it
+        self.node = Node(HIDDEN_NODE, namespace=node.get_fully_qualified_name(),
+                         context=node.context, use_global_arguments=False, enable_rosout=False,
+                         start_parameter_services=False)
+        self._spinner = Spinner(self.node)
+        self._thread = Thread(target=self._serve, name='pose graph services', daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        self._spinner.spin()
+        self._spinner.close()
+        self.node.destroy_node()
+
+    def destroy(self, services: Sequence[Service]) -> None:
+        """Destroy services of the node, once what is done at present is done."""
+        def act() -> None:
+            for service in services:
+                self.node.destroy_service(service)
+        assert self.node.executor is not None, 'it spins'
+        self.node.executor.create_task(act)
+
+    def close(self, timeout: float) -> None:
+        """Destroy the node once what is done at present is done; wait up to a time for it [s]."""
+        self._spinner.stop()
+        self._thread.join(timeout)
 
 
 class Services:
     """Offers the services of a configured node."""
 
-    def __init__(self, node: Node, session: Session) -> None:
-        self._node, self._session = node, session
+    def __init__(self, node: Node, session: Session, thread: ServiceThread) -> None:
+        self._node, self._session, self._thread = node, session, thread
         self._closed = self._saving = False
         self._quick = [node.create_service(Trigger, '~/reset', self._answering(self._reset)),
                        node.create_service(SetBool, '~/pause', self._answering(self._pause))]
-        # it is within the node's own name, and none of the arguments that rename that are for it
-        self._own = Node(HIDDEN_NODE, namespace=node.get_fully_qualified_name(),
-                         context=node.context, use_global_arguments=False, enable_rosout=False,
-                         start_parameter_services=False)
-        for name, act in (('optimize', self._optimize), ('set_datum', self._set_datum),
-                          ('undo_reset', self._undo_reset),
-                          ('save_graph', self._with_file(self._save)),
-                          ('load_graph', self._with_file(self._load))):
-            self._own.create_service(Trigger, name, self._answering(act))
-        self._spinner = Spinner(self._own)
-        Thread(target=self._serve, name=SERVICE_THREAD, daemon=True).start()
-
-    def _serve(self) -> None:
-        self._spinner.spin()
-        self._spinner.close()
-        self._own.destroy_node()
+        self._waiting = [
+            thread.node.create_service(Trigger, name, self._answering(act)) for name, act in (
+                ('optimize', self._optimize), ('set_datum', self._set_datum),
+                ('undo_reset', self._undo_reset), ('save_graph', self._with_file(self._save)),
+                ('load_graph', self._with_file(self._load)))]
 
     def close(self) -> None:
         """
@@ -73,7 +98,7 @@ class Services:
             logger.warning('the graph is still being saved')
         for service in self._quick:
             self._node.destroy_service(service)
-        self._spinner.stop()
+        self._thread.destroy(self._waiting)
 
     def _answering(self, act: Callable[[Any], Answer]) -> Callable[[Any, Any], Any]:
         """Return the callback of a service, which never raises."""

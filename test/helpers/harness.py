@@ -171,9 +171,13 @@ class Client:
         self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
                         and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
                         'the node listens')
-        self.spin_until(lambda: self.values['prepared'] == '1', 'the node has compiled',
-                        PREPARE_PATIENCE)
+        self.wait_prepared()
         self.wait_matched()
+
+    def wait_prepared(self) -> None:
+        """Wait for diagnostics of a node that has compiled its kernels, or loaded them."""
+        self.spin_until(lambda: len(self.diagnostics) > 0 and self.values['prepared'] == '1',
+                        'the node has compiled', PREPARE_PATIENCE)
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -11,9 +11,9 @@ import time
 from harness import Client, NodeProcess, odometry, pose, stamp_ns
 import numpy as np
 
-KILLS = int(os.environ.get('POSE_GRAPH_KILLS', '12'))
-# The default of state_period, after which all is on the disk, and what a busy machine takes [s].
-WINDOW = float(os.environ.get('POSE_GRAPH_WINDOW', '3.0'))
+KILLS = int(os.environ.get('POSE_GRAPH_KILLS', '50'))
+# The default of state_period, after which all is on the disk [s].
+WINDOW = 1.0
 RADIUS, SPEED, STEP = 30.0, 20.0, 0.05  # of the drive, a circle [m], [m/s], [s]
 
 
@@ -43,14 +43,15 @@ def test_nothing_older_than_the_window_is_missing_after_a_kill(tmp_path: Path) -
         process = stack.enter_context(NodeProcess(tmp_path, arguments))
         domain = int(process.env['ROS_DOMAIN_ID'])
         client = stack.enter_context(Client(domain))
-        drive, moves, lags = Drive(client), list[float](), list[float]()
+        drive, moves, lag = Drive(client), list[float](), 0.0
+        held: list[tuple[float, int, int]] = []     # when what was in the graph
         for kill in range(KILLS):
-            held: list[tuple[float, int, int]] = []
-            end = time.monotonic() + rng.uniform(0.2, 3.0)
+            end = time.monotonic() + rng.uniform(0.1, 2.0)
             while time.monotonic() < end:
                 drive.step()
                 values = client.values
-                lags.append(float(values.get('journal.lag_max_s', 0.0)))
+                # of a busy disk or processor the node says so
+                lag = max(lag, float(values['journal.lag_max_s']))
                 if 'hidden_nodes' in values:
                     held.append((time.monotonic(), int(values['hidden_nodes']),
                                  int(values['observed_nodes'])))
@@ -64,25 +65,26 @@ def test_nothing_older_than_the_window_is_missing_after_a_kill(tmp_path: Path) -
             folder = tmp_path / str(kill)
             folder.mkdir()
             process = stack.enter_context(NodeProcess(folder, arguments, domain))
-            client.wait_for_the_node()
-            safe = [(nodes, observed) for at, nodes, observed in held if at < killed_at - WINDOW]
+            client.wait_prepared()
+            held = [each for each in held if each[0] < killed_at - max(WINDOW, lag)]
             log = process.stderr()
             assert '.bad-' not in log, 'never a file that does not load'
             if len(path) == 0:
                 continue
-            client.spin_until(lambda: len(client.paths) > 0, 'the path is there again')
+            client.spin_until(lambda: len(client.paths) > 0 and 'hidden_nodes' in client.values,
+                              'the path is there again')
             again = {stamp_ns(each): each.pose.position for each in client.paths[0].poses}
             # but for the newest odometry at its end
             moves.append(max((math.dist(
                 (was.x, was.y), (again[stamp_ns(each)].x, again[stamp_ns(each)].y))
                 for each in path[:-1] for was in [each.pose.position]), default=0.0))
-            nodes, observed = max(safe, default=(0, 0))
+            _, nodes, observed = max(held, default=(0.0, 0, 0))
             assert int(client.values['hidden_nodes']) >= nodes
             assert int(client.values['observed_nodes']) >= observed
             assert 'continuing with' in log
         exact = sum(move < 1e-9 for move in moves)
         print(f'{len(moves)} kills with a path, {exact} with the same, others moved by '
-              f'{sorted(moves)[-5:]} m; longest lag {max(lags)} s')
+              f'{sorted(moves)[-5:]} m; longest lag {lag} s')
         # what was published is there to the bit, or that which was about to be
         assert max(moves) < 0.5
         assert exact > 0.5 * len(moves)
@@ -104,7 +106,7 @@ def test_odometry_that_begins_anew_after_a_kill_is_joined_to_the_same_map(tmp_pa
         domain = int(process.env['ROS_DOMAIN_ID'])
         client = stack.enter_context(Client(domain))
         x = straight(client, 100.0, 0.0, 0.0)
-        client.spin_for(WINDOW)
+        client.spin_for(2.0 * WINDOW)
         process.process.kill()
         process.process.wait()
         for kept in (client.paths, client.diagnostics):
