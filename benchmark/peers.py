@@ -56,7 +56,7 @@ def bursts(options: Options) -> Section:
     to the arrival of `pose` with its stamp; memory is what the node has more at the end than
     before the burst. A start of another graph (`~/reset`, `~/load_graph`) leaves odometry without
     a pose until the next estimate. `answered` are calls that had an answer when the last one was
-    sent: of those that wait, DDS keeps the newest ten, and 1000 that set parameters.
+    sent: of those that wait, DDS keeps the newest ten.
     """
     section = Section('Bursts of each kind', about(bursts))
     table = section.table('', 'kind', 'sent', 'answered', 'no output', 'p99 before [ms]',

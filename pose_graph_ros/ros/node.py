@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node: its parameters and the transitions of its lifecycle."""
 
-from collections import deque
 from collections.abc import Callable, Sequence
 import logging
-import math
 import time
 from typing import Any
 
@@ -23,8 +21,9 @@ from pose_graph_ros.ros.graph_folder import with_folder
 
 logger = logging.getLogger(__name__)
 
-# Of parameters in a second: each is checked with all others, and odometry waits meanwhile.
-MOST_CHANGES = 100
+# Of parameters, at once and in a second from then on: each is checked with all others, and odometry
+# waits meanwhile.
+MOST_CHANGES, CHANGE_RATE = 100, 20.0
 
 
 class PoseGraphNode(LifecycleNode):
@@ -38,7 +37,7 @@ class PoseGraphNode(LifecycleNode):
     def __init__(self, **node_options: Any) -> None:
         # what a file or the command line gives, also to parameters that are not declared
         self._overrides: dict[str, Any] = {}
-        self._changed_at = deque([-math.inf] * MOST_CHANGES, MOST_CHANGES)  # when, the newest [s]
+        self._changes_until = 0.0   # how far those so far reach at the rate that is allowed [s]
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = log.NodeLog(self.get_logger())
@@ -191,13 +190,14 @@ class PoseGraphNode(LifecycleNode):
         A parameter, also a read-only one, can be set to the value that it has, and one that is
         not set to nothing, so that a node takes what `ros2 param dump` has written of it.
         """
-        if time.monotonic() - self._changed_at[0] < 1.0:
-            return _refused(f'more than {MOST_CHANGES} changes of parameters in a second: wait')
+        now = time.monotonic()
+        if self._changes_until > now + MOST_CHANGES / CHANGE_RATE:
+            return _refused(f'more than {MOST_CHANGES} changes of parameters at once: wait')
         changes = []
         for parameter in parameter_list:
             name = parameter.name
             if not self.has_parameter(name):
-                self._changed_at.append(time.monotonic())
+                self._count_change(now)
                 return _refused(rules.unknown(name, self._own))
             value = self._plain(name, parameter.value)
             # rclpy refuses what is read-only; without a value it would undeclare it
@@ -207,7 +207,7 @@ class PoseGraphNode(LifecycleNode):
         own = {each.name: each.value for each in changes if each.name in self._own}
         if len(changes) == 0:
             return SetParametersResult(successful=True)
-        self._changed_at.append(time.monotonic())
+        self._count_change(now)
         try:
             given = rules.changed(self._given, own, configured=self._session is not None)
         except ConfigError as error:
@@ -223,6 +223,9 @@ class PoseGraphNode(LifecycleNode):
                 logger.exception('a change of parameters failed')
                 return _refused(f'failed: {type(error).__name__}: {error}')
         return result
+
+    def _count_change(self, now: float) -> None:
+        self._changes_until = max(self._changes_until, now) + 1.0 / CHANGE_RATE
 
     def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
         """Set several parameters, each for itself."""
