@@ -21,8 +21,8 @@ from pose_graph_ros.ros.graph_folder import with_folder
 
 logger = logging.getLogger(__name__)
 
-# Of parameters, at once and in a second from then on: each is checked with all others, and odometry
-# waits meanwhile.
+# Of parameters, at once and in a second from then on: each is checked with all others, while
+# odometry waits.
 MOST_CHANGES, CHANGE_RATE = 100, 20.0
 
 

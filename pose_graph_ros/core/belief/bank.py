@@ -278,9 +278,11 @@ class Bank:
         if begin == 0:
             return
         self._first_node = int(self._rows['node'][begin - 1])
-        for column in (self._rows, self._tree, self._path):
+        for column in (self._rows, self._tree):
             column.drop_first(begin)
-        self.done, self._traced = self.done - begin, self._traced - begin
+        # the path may not reach as far yet
+        self._path.drop_first(min(begin, len(self._path)))
+        self.done, self._traced = self.done - begin, max(self._traced - begin, 0)
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 

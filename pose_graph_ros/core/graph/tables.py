@@ -300,6 +300,14 @@ class Memory:
         """Return a table with all its capacity; invalid after the next `ensure`."""
         return self._tables[name]
 
+    def take(self, other: 'Memory') -> None:
+        """
+        Take over what another one has, which is not used any more.
+
+        The head stays the same array: who has it must not go on with tables that are freed.
+        """
+        self.head[:], self._tables = other.head, other._tables  # noqa: SLF001
+
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
         """Make a table grow to at least a given number of rows."""
         at = 2 * NAMES.index(name)

@@ -166,7 +166,7 @@ class IncrementalSmoother:
         trial.catch_up()
         result = other._step(step.AFTER_BATCH)
         if result.status is not Status.FAILED:
-            self.graph.memory = self._memory = other.graph.memory
+            self._memory.take(other.graph.memory)
         return result
 
     def interrupt(self, what: int = tb.REFINEMENT, *, on: bool = True) -> None:
@@ -375,7 +375,7 @@ class IncrementalSmoother:
         if trial.optimize_copy(other.graph, rows, leaving):
             result = other._eliminate()
             if result.status is not Status.FAILED:
-                self.graph.memory = self._memory = other.graph.memory
+                self._memory.take(other.graph.memory)
                 return result
         return UpdateResult(
             Status.FAILED, INTERRUPTED if self._memory.interrupted else

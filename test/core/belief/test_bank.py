@@ -244,6 +244,21 @@ def test_the_oldest_rows_can_be_forgotten() -> None:
         assert again.told(0).choice.tolist() == bank.told(0).choice.tolist()
 
 
+def test_rows_can_be_forgotten_by_a_bank_that_is_filtered_again_and_has_decided_on_none() -> None:
+    drive = Drive(5, 300)
+    drive.fixes[290:] += (40.0, 10.0)
+    bank = drive.bank()
+    bank.decide()
+    again = bank.again(as_claimed(), 200)
+    again.advance(80)
+    again.forget(drive.rows()['id'][170:], 100)
+    assert len(again) < 200
+    while again.advance(7):
+        pass
+    again.decide()
+    assert again.told(0).choice.tolist() == bank.told(0).choice[-len(again):].tolist()
+
+
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('seen', [33, 45, 60])
 def test_the_newest_pose_allows_for_wrong_fixes_at_the_start(seed: int, seen: int) -> None:

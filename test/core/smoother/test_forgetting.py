@@ -300,3 +300,34 @@ def test_all_nodes_can_leave_and_the_smoother_goes_on() -> None:
     other = Graph()
     other.fill(smoother.graph.rows())
     assert other.newest_pose == first + 1
+
+
+@pytest.mark.parametrize('seed', [57, 97, 294])
+def test_a_step_that_diverges_while_nodes_leave_leaves_no_stale_tables(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    smoother = tangled(rng)
+    ids, head = smoother.graph.node_ids, smoother.graph.memory.head
+    smoother.forget(ids[1:1 + int(len(ids) * rng.uniform(0.1, 0.5))].tolist())
+    # kernels have the addresses of all tables from it
+    assert smoother.graph.memory.head is head
+    assert np.all(np.isfinite(smoother.newest_covariance()))
+    assert smoother.update(GraphUpdate()).status is not Status.FAILED
+
+
+def tangled(rng: np.random.Generator) -> IncrementalSmoother:
+    """Return a smoother of a chain with wrong closures whose next step diverges."""
+    smoother = IncrementalSmoother()
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=(0,)))
+    n_nodes = int(rng.integers(150, 500))
+    turn, sigma = rng.choice([0.0, 2.0 * np.pi / 50.0, 0.3]), 10.0**rng.uniform(-2.0, 0.0)
+    sigmas = sigma * np.array([1.0, 1.0, 0.3])
+    information = np.diag(sigmas**-2)
+    for k in range(n_nodes - 1):
+        smoother.extend(np.array([1.0, 0.0, turn]) + rng.normal(size=3) * sigmas, information)
+        if rng.random() < 0.05 and k > 20:
+            at, spread = int(rng.integers(0, k - 10)), rng.random() < 0.5
+            closure = rng.normal(size=3) * ((10.0, 10.0, 2.0) if spread else (0.1, 0.1, 0.05))
+            smoother.update(GraphUpdate(factors=Factors(
+                [at], [k + 1], closure[None], information[None] * rng.choice([0.1, 1.0, 10.0]),
+                [FactorKind.LOOP_CLOSURE])), fall_back=bool(rng.random() < 0.5))
+    return smoother
