@@ -23,8 +23,9 @@ if [ -z "${ROS_DISTRO:-}" ]; then
 else
     echo '--- mypy: left out, it is exact only with the NumPy of requirements.lock'
 fi
-# files in parallel: many of their tests wait for other processes
-[ "$#" -gt 0 ] || set -- -n "${PYTEST_WORKERS:-3}" --dist loadfile --no-loadscope-reorder
+# Files in parallel: many of their tests wait for other processes, those of the node longest, so they
+# come first.
+[ "$#" -gt 0 ] || set -- -n "${PYTEST_WORKERS:-3}" --dist loadfile --no-loadscope-reorder test/ros test
 run pytest "$PYTHON" -m pytest -ra --durations=20 "$@"
 
 if [ "${#failed[@]}" -gt 0 ]; then
