@@ -236,11 +236,13 @@ def _repaired(path: Path, reason: str, stack: ExitStack) -> Reader | None:
     folder = stack.enter_context(TemporaryDirectory(prefix='pose_graph_'))
     copy = Path(folder, 'bag')
     try:
-        found = repair(path, reason, copy)
+        return _opened(Rosbag2Reader(copy), stack) if repair(path, reason, copy) else None
     except OSError as error:
         raise BagError(f'{path}: {reason}; what can be read of it cannot be copied to '
                        f'{folder}: {one_line(error)}') from error
-    return _opened(Rosbag2Reader(copy), stack) if found else None
+    except Exception as error:  # what can be read need not be what a bag may have
+        logger.info('%s cannot be repaired: %s', path, one_line(error))
+        return None
 
 
 def own_types(connection: Connection) -> Typestore | None:
