@@ -106,7 +106,8 @@ class Robot:
         estimate = self.backend.estimate()
         if estimate is not None:
             n = estimate.n_hidden
-            self._wait(KnownPath(estimate.path.stamps_ns[:n], estimate.path.poses[:n]))
+            self._wait(KnownPath(estimate.path.stamps_ns[:n], estimate.path.poses[:n],
+                                 self.backend.parts.alignment.is_aligned))
 
     def keep_state(self) -> float:
         """Let the journal have the state; return how long it took to copy it [s]."""

@@ -7,6 +7,8 @@ Measurements come in the same order, with updates between them as there were. Th
 published last is taken as it was, as solving again does not give the same bits.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 import logging
 
@@ -23,13 +25,17 @@ from pose_graph_ros.core.saved_columns import MISMATCHES
 
 logger = logging.getLogger(__name__)
 
+Over = Callable[[PoseGraphBackend, str], AbstractContextManager[None]]
 
-def recovered(config: BackendConfig, found: Found, place: Place) -> PoseGraphBackend:
+
+def recovered(config: BackendConfig, found: Found, place: Place,
+              over: Over = lambda *_: nullcontext()) -> PoseGraphBackend:
     """
     Return an engine that continues where the journal ends.
 
-    `place` returns the position in the map of a latitude, longitude and altitude. What cannot be
-    done again is logged and left out. Raises FileFormatError where the state does not fit.
+    `place` returns the position in the map of a latitude, longitude and altitude; what takes long
+    is done within `over`, which may interrupt the engine. What cannot be done again is logged and
+    left out. Raises FileFormatError where the state does not fit.
     """
     if found.state is None:
         backend = PoseGraphBackend(config)
@@ -46,15 +52,17 @@ def recovered(config: BackendConfig, found: Found, place: Place) -> PoseGraphBac
             if entry.name == 'resume' and entry.act > 0:
                 backend = _again(backend, config, KnownPath())
             else:
-                _do(backend, entry, place)
+                _do(backend, entry, place, over)
         except Exception:
             n_failed += 1
             if n_failed == 1:
                 logger.exception('from the journal, %s cannot be done again', entry[:3])
-    return _again(backend, config, found.path)
+    # the map can be elsewhere than where a path from before its alignment is
+    fits = found.path.is_aligned == backend.parts.alignment.is_aligned
+    return _again(backend, config, found.path if fits else KnownPath())
 
 
-def _do(backend: PoseGraphBackend, entry: Entry, place: Place) -> None:
+def _do(backend: PoseGraphBackend, entry: Entry, place: Place, over: Over) -> None:
     if entry.act == 0:
         measurement = measurement_of(entry.values, place)
         if isinstance(measurement, ms.OdometrySample):
@@ -67,10 +75,12 @@ def _do(backend: PoseGraphBackend, entry: Entry, place: Place) -> None:
     elif entry.name == 'set_pose':
         pose, source = entry.values
         backend.set_pose(measurement_of(pose, place), source)
-    elif entry.name == 'optimize':
-        backend.optimize()
     else:
-        backend.update()
+        with over(backend, 'what was done before'):
+            if entry.name == 'optimize':
+                backend.optimize()
+            else:
+                backend.update()
 
 
 def _again(backend: PoseGraphBackend, config: BackendConfig, path: KnownPath) -> PoseGraphBackend:

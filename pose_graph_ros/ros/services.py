@@ -192,6 +192,8 @@ class Services:
         status, datum = worker.status, session.input.reader.datum
         used = sum(status.counts[name, 'accepted'] for name, source
                    in session.input.reader.sources.items() if source.kind.on_earth)
+        if datum.is_given:
+            return False, 'refused: it is given by the parameter datum'
         if datum.is_of_graph:
             return False, 'refused: the graph that was loaded refers to the present datum'
         if (plane := datum.plane) is not None and used > 0:

@@ -8,7 +8,7 @@ the newest estimate, propagated by it, is published; path and markers are after 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
 import logging
@@ -37,6 +37,7 @@ from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.ros import diagnostics, log, publishers, spinning, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.stored_graphs import continued, from_journal, initial_graph, journal_of
+from pose_graph_ros.ros.watchdog import Watchdog
 from pose_graph_ros.ros.worker import SetPoseInput, Worker
 
 logger = logging.getLogger(__name__)
@@ -84,28 +85,34 @@ class Session:
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.journal = journal = journal_of(values)
+        self._closing, self._recovering = False, Watchdog()
+        kept = self.input.reader.datum
 
         def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
             self._warm_up(stopped)
-            backend = None if journal is None or stopped() else from_journal(
-                journal, self._config, self.input.reader.datum)
-            if backend is None and path is not None and not stopped():
+            # also what was replaced meanwhile, as it can be brought back
+            backend = None if journal is None or self._closing else from_journal(
+                journal, self._config, kept, self._recovering.over)
+            if backend is None and path is not None and not self._closing:
                 backend = continued(path, values['file_folder'], self._config)
             if backend is None and not stopped():
                 self._set_loaded(is_loaded=False)
             return backend
 
         if datum is not None:
-            self.input.reader.datum.keep(datum)
-        self._begin(PoseGraphBackend(self._config), prepare,
+            kept.keep(datum)
+        self._begin(PoseGraphBackend(self._config), prepare, has_graph=path is not None,
                     resumes=journal is not None or path is not None)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
-        self._set_timer('watchdog', 0.2, lambda: self.worker.watchdog.watch(
-            self.values['solve_timeout']))
+        self._set_timer('watchdog', 0.2, self._watch)
+
+    def _watch(self) -> None:
+        for each in (self._recovering, self.worker.watchdog):
+            each.watch(self.values['solve_timeout'])
 
     def _begin(self, backend: PoseGraphBackend, prepare: Callable[[Callable[[], bool]], Any], *,
-               resumes: bool) -> None:
-        """Start the thread that owns a graph, which may resume a drive."""
+               resumes: bool, has_graph: bool) -> None:
+        """Start the thread that owns a graph, which may resume a drive, of the journal or not."""
         self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
                             for name, source in self._config.odometry.items()}
         self._set_loaded(is_loaded=resumes)
@@ -114,7 +121,7 @@ class Session:
         graph = self.out.graph
         self.worker = worker = Worker(
             backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare,
-            None if self.journal is None else self.journal.begin(has_state=resumes))
+            None if self.journal is None else self.journal.begin(has_state=has_graph))
         worker.thread.start()
         if resumes:
             self._keep_state()
@@ -180,12 +187,14 @@ class Session:
 
     def close(self) -> None:
         """Stop the worker; destroy subscriptions, timers and publishers."""
+        self._closing = True
         if self.active:
             self.deactivate()
         for name in ('diagnostics', 'watchdog'):
             self.node.destroy_timer(self._timers.pop(name))
         if self.journal is not None:
-            with suppress(CancelledError, TimeoutError):
+            # a failure is logged, and all else has to be closed
+            with suppress(Exception):
                 self._keep_state().result(STOP_TIMEOUT)
         if not self.worker.stop(STOP_TIMEOUT):
             logger.warning('stopping in the middle of %s',
@@ -347,7 +356,8 @@ class Session:
         self.input.start_new_graph(self.values, reader)
         self._set_pose_input.waiting = None
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
-        self._begin(backend, (lambda _: None) if prepared else self._warm_up, resumes=resumes)
+        self._begin(backend, (lambda _: None) if prepared else self._warm_up, resumes=resumes,
+                    has_graph=resumes)
 
     # ---- timers
 

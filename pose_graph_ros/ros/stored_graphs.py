@@ -15,7 +15,7 @@ from pose_graph_ros.core.geometry import geodesy
 from pose_graph_ros.core.io import graph_files
 from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph, site_refusal
 from pose_graph_ros.core.io.journal import Journal
-from pose_graph_ros.core.recovery import recovered
+from pose_graph_ros.core.recovery import Over, recovered
 from pose_graph_ros.ros.graph_folder import graph_path
 
 logger = logging.getLogger(__name__)
@@ -34,17 +34,18 @@ def journal_of(values: Mapping[str, Any]) -> Journal | None:
         None if plane is None else site_refusal(saved, plane.origin, None)))
 
 
-def from_journal(journal: Journal, config: BackendConfig, datum: Datum) -> PoseGraphBackend | None:
+def from_journal(journal: Journal, config: BackendConfig, datum: Datum,
+                 over: Over) -> PoseGraphBackend | None:
     """Return an engine that continues what a journal holds, with its datum; None if nothing."""
     found = journal.take()
     state, n = found.state, sum(entry.act == 0 for entry in found.entries)
     if found.last == (0, 0):
         logger.info('the journal is empty: starting with an empty graph')
         return None
-    if state is not None and state.saved.datum is not None:
-        datum.keep(state.saved.datum)
     try:
-        backend = recovered(config, found, datum.place)
+        if state is not None and state.saved.datum is not None:
+            datum.keep(state.saved.datum)
+        backend = recovered(config, found, datum.place, over)
     except Exception as error:
         logger.exception('nothing can be made of the journal: starting with an empty graph')
         journal.set_aside(f'nothing can be made of it: {error}')

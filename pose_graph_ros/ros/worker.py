@@ -307,7 +307,8 @@ class Worker:
         """Let the journal have a path that is about to be published, in this thread."""
         if self.chapter is not None and path.alignment is not AlignmentState.UNALIGNED:
             n = path.n_hidden   # without the newest odometry
-            self.chapter.keep_path(KnownPath(path.path.stamps_ns[:n], path.path.poses[:n]))
+            self.chapter.keep_path(KnownPath(path.path.stamps_ns[:n], path.path.poses[:n],
+                                             path.alignment is AlignmentState.ALIGNED))
 
     def keep_state(self, datum: geodesy.MapOrigin | None) -> None:
         """Let the journal have the state of the engine, in this thread."""

@@ -108,6 +108,8 @@ class Journal:
         self._condition = threading.Condition()
         self._is_wanted = self._closing = False
         self._unusable = ''  # why what was found cannot be used
+        # since there is a gap, measurements that the next checkpoint may not have
+        self._left: list[Entry] = []
         self._n_chapters, self._chapter = 0, Chapter(self, 0)
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
@@ -121,11 +123,10 @@ class Journal:
         """
         Return the next chapter: the first one continues what was found, others replace it.
 
-        One whose engine has a state already replaces it with its first checkpoint.
+        One whose engine has a state from elsewhere begins with its first checkpoint.
         """
         self._n_chapters += 1
-        chapter = Chapter(self, self._n_chapters,
-                          awaits_state=has_state and self._n_chapters > 1)
+        chapter = Chapter(self, self._n_chapters, awaits_state=has_state)
         self.put(chapter, None)
         return chapter
 
@@ -165,6 +166,7 @@ class Journal:
         found = Found()
         try:
             found = self._file.read(self._refusal)
+            self._file.take(found)
         except Exception as error:
             self._fail(error)
         self._found.set_result(found)
@@ -176,13 +178,18 @@ class Journal:
                     lambda: self._is_wanted or self._closing, 0.5 * self._period)
                 closing, self._is_wanted = self._closing, False
             items = [self._items.popleft() for _ in range(len(self._items))]
+            batch = Batch()
             try:
-                self._write(self._batch(items, last))
+                batch = self._batch(items, last)
+                self._write(batch)
             except Exception as error:
                 self._fail(error)
-            else:
-                if len(items) > 0 and not self.has_gap:
-                    self.lag = max(self.lag, time.monotonic() - items[0][0])
+            if self.has_gap:
+                taken = self._chapter.base[0] + self._chapter.taken
+                self._left = [each for each in batch.entries
+                              if each.act == 0 and each.number > taken]
+            elif len(items) > 0:
+                self.lag = max(self.lag, time.monotonic() - items[0][0])
             for *_, event in items:
                 if event is not None:
                     event.set()
@@ -191,11 +198,12 @@ class Journal:
                 return
 
     def _batch(self, items: Sequence[Item], found: tuple[int, int]) -> Batch:
-        batch = Batch()
+        batch, self._left = Batch(entries=self._left), []
         for k, (_, chapter, item, _) in enumerate(items):
-            if chapter.number < self._chapter.number:
-                continue
-            if item is None and chapter.awaits_state:
+            if (chapter is not self._chapter if item is not None else any(
+                    each is None and of.number > chapter.number for _, of, each, _ in items[k:])):
+                continue    # of a chapter that was replaced
+            if item is None and chapter.awaits_state and (chapter.number > 1 or found == (0, 0)):
                 if not any(isinstance(each, Checkpoint) and of is chapter
                            for _, of, each, _ in items[k:]):
                     self._items.extendleft(reversed(items[k:]))

@@ -36,7 +36,8 @@ APPLICATION, VERSION = 0x506F4752, 1  # in the header of the file
 PART = 16_384   # largest size of a part of an array [bytes]
 INLINE = 64     # arrays of at most so many numbers are not cut out
 LARGEST_WAL = 2_000_000     # of the file beside it, in which SQLite writes first [bytes]
-ENDING = 20     # tenths of a second for which a process that ends may still have the file
+ENDING = 100    # tenths of a second for which who ends may still write the file
+MEMORY = '/dev/shm'     # where there is room for a copy on a full disk
 PARTS = '#parts'    # key of the digests of an array's parts
 SCHEMA = '''
     CREATE TABLE part (digest BLOB PRIMARY KEY, content BLOB NOT NULL);
@@ -70,6 +71,7 @@ class KnownPath(NamedTuple):
 
     stamps_ns: IntArray = np.empty(0, np.int64)
     poses: FloatArray = np.empty((0, 3))
+    is_aligned: bool = False  # whether the poses are in the map, not in the odometry frame
 
 
 class Found(NamedTuple):
@@ -130,8 +132,7 @@ class JournalFile:
         self.path = path
         self._lock: IO[bytes] | None = None  # of the process that uses the file
         self._connection: sqlite3.Connection | None = None
-        self._identity: tuple[int, int] | None = None
-        self._is_read = False  # whether there is nothing in the file that was never read
+        self._identity: tuple[int, int] | None = None  # of the file whose content is known
         self._parts: set[bytes] = set()  # digests of those in the file
         self._path = KnownPath()  # the last one in the file
 
@@ -142,10 +143,10 @@ class JournalFile:
 
     def read(self, refusal: Callable[[SavedGraph], str | None]) -> Found:
         """
-        Return what is in the file; a bad one, or one that is refused, is renamed.
+        Return what is in the file, as far as it can be read and is not refused.
 
         A copy is read, as SQLite would change a file that it opens. Where the file cannot be
-        written, it is read all the same.
+        written, or there is no room for a copy, it is read all the same.
         """
         try:
             self._claim()
@@ -155,20 +156,23 @@ class JournalFile:
             pass
         if not any(path.exists() for path in _files(self.path)):
             return Found()
-        with TemporaryDirectory() as folder:
-            copy = Path(folder, self.path.name)
-            for path, other in zip(_files(self.path), _files(copy), strict=True):
-                if path.exists():
-                    shutil.copy(path, other)
-            found = _found(copy)
+        for place in (None, MEMORY):
+            with contextlib.suppress(OSError), TemporaryDirectory(dir=place) as folder:
+                found = _found(_copied(self.path, Path(folder)))
+                break
+        else:
+            found = _found(self.path)
         if found.state is not None and (refused := refusal(found.state.saved)) is not None:
             found = Found(trouble=refused)
+        return found
+
+    def take(self, found: Found) -> None:
+        """Go on with the file that was read; if it was bad, with a new one beside it."""
         if found.trouble != '':
             self.set_aside(found.trouble)
             self.write(Batch(
                 entries=[*found.entries], path=found.path, checkpoint=found.state))
-        self._is_read = True
-        return found
+        self._identity = _identity(self.path)
 
     def close(self) -> None:
         """Close the file, which the next `write` opens again."""
@@ -189,11 +193,10 @@ class JournalFile:
         connection = self._connection
         if connection is None:
             self._claim()
-            if not self._is_read and self.path.exists():
-                self.set_aside('it could not be read at the start')
+            if self.path.exists() and _identity(self.path) != self._identity:
+                self.set_aside('it is not the file that was read')
             connection, self._parts = _connected(self.path)
             self._connection, self._identity = connection, _identity(self.path)
-            self._is_read = True
         parts = self._parts
         try:
             connection.execute('BEGIN IMMEDIATE')
@@ -206,10 +209,12 @@ class JournalFile:
                 self._path = KnownPath(
                     batch.checkpoint.saved.nodes.stamps_ns, batch.checkpoint.saved.path)
             if len(batch.entries) > 0:
-                self._log(connection, batch.entries[-1][:2], batch.entries)
+                # an act comes after measurements that the engine had not taken
+                self._log(connection, max(each[:2] for each in batch.entries), batch.entries)
             if batch.path is not None:
                 # a row of its own, so that the next checkpoint removes it
-                self._log(connection, (0, 0), [], _moved(self._path, batch.path))
+                self._log(connection, (0, batch.path.is_aligned), [],
+                          _moved(self._path, batch.path))
                 self._path = batch.path
             connection.execute('COMMIT')
         except BaseException:
@@ -302,6 +307,14 @@ def _found(path: Path) -> Found:
         trouble=f'its newest part is damaged: of {n_commits} pages {n_whole} are whole')
 
 
+def _copied(path: Path, folder: Path) -> Path:
+    copy = folder / path.name
+    for each, other in zip(_files(path), _files(copy), strict=True):
+        if each.exists():
+            shutil.copy(each, other)
+    return copy
+
+
 def _files(path: Path) -> list[Path]:
     return [path.with_name(path.name + suffix) for suffix in ('', '-wal', '-shm')]
 
@@ -369,11 +382,11 @@ def _moved(before: KnownPath, after: KnownPath) -> Any:
     return moved
 
 
-def _with(path: KnownPath, moves: Any) -> KnownPath:
+def _with(path: KnownPath, moves: Any, is_aligned: bool) -> KnownPath:
     """Return a path in which some nodes have moved or are new."""
     n = max(len(path.stamps_ns), int(moves['node'][-1]) + 1)
-    changed = KnownPath(np.zeros(n, np.int64), np.zeros((n, 3)))
-    for new, old, name in zip(changed, path, ('stamp_ns', 'pose'), strict=True):
+    changed = KnownPath(np.zeros(n, np.int64), np.zeros((n, 3)), is_aligned)
+    for new, old, name in zip(changed[:2], path[:2], ('stamp_ns', 'pose'), strict=True):
         new[:len(old)] = old
         new[moves['node']] = moves[name]
     return changed
@@ -392,8 +405,8 @@ def _read(connection: sqlite3.Connection) -> Found:
     begin = (0, 0) if state is None else state.last
     (number, act), path, entries = begin, known, list[Entry]()
     try:
-        for digest, content, change in connection.execute(
-                'SELECT digest, content, moved FROM log ORDER BY row'):
+        for digest, content, change, is_aligned in connection.execute(
+                'SELECT digest, content, moved, act FROM log ORDER BY row'):
             _check(digest, content + change)
             for entry in (Entry(*item) for item in json.loads(content)):
                 if entry[:2] <= begin:
@@ -403,7 +416,7 @@ def _read(connection: sqlite3.Connection) -> Found:
                     raise FileFormatError(f'{entry[:2]} follows {number, act}')
                 entries.append(entry)
             if len(change) > 0:
-                path = _with(path, np.frombuffer(change, MOVED))
+                path = _with(path, np.frombuffer(change, MOVED), bool(is_aligned))
     except (*sc.MISMATCHES, FileFormatError, sqlite3.Error) as error:
         trouble = trouble or f'its log is damaged: {error}'
     return Found(state, sorted(entries, key=lambda each: each[:2]),

@@ -9,6 +9,7 @@ from pathlib import Path
 import resource
 import shutil
 import sqlite3
+import tempfile
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -18,9 +19,11 @@ from test_delay_invariance import CONFIGS, drive, SAME_PATH
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, WindowConfig
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io import journal_file
 from pose_graph_ros.core.io.journal import Journal
-from pose_graph_ros.core.io.journal_file import Found, JournalFile, KnownPath
+from pose_graph_ros.core.io.journal_file import Entry, Found, JournalFile, KnownPath, plain
+from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.core.recovery import recovered
 
 PERIOD = 0.02   # [s]
@@ -70,7 +73,8 @@ class Drive:
 
 def path_of(backend: PoseGraphBackend) -> KnownPath:
     nodes = backend.parts.nodes
-    return KnownPath(nodes.stamps_ns.copy(), nodes.poses(backend.graph))
+    return KnownPath(nodes.stamps_ns.copy(), nodes.poses(backend.graph),
+                     backend.parts.alignment.is_aligned)
 
 
 def events(kind: str) -> list[Event]:
@@ -137,7 +141,9 @@ def copied(of: Drive, folder: Path) -> list[Path]:
 def opened(folder: Path) -> Found:
     file = JournalFile(folder / 'state.db')
     try:
-        return file.read(lambda _: None)
+        found = file.read(lambda _: None)
+        file.take(found)
+        return found
     finally:
         file.close()
 
@@ -214,6 +220,83 @@ def test_a_full_disk_is_told_and_nothing_is_missing_when_there_is_room_again(
     then = begun.killed()
     assert then.found.trouble == ''
     np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    then.journal.close(5.0)
+
+
+@pytest.mark.parametrize('memory', ['/dev/shm', '/nowhere'])
+def test_without_room_for_a_copy_it_is_read_all_the_same(
+    begun: Drive, memory: str, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tempfile, 'tempdir', '/nowhere')
+    monkeypatch.setattr(journal_file, 'MEMORY', memory)
+    then = begun.killed()
+    np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    driven(then, 10)
+    assert then.journal.failure == ''
+    then.journal.close(5.0)
+
+
+def test_what_can_be_read_of_a_damaged_file_is_used_though_no_new_one_can_be_made(
+    written: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = tmp_path / 'state.db'
+    copied(written, tmp_path)
+    wal = file.with_name('state.db-wal')
+    content = bytearray(wal.read_bytes())
+    content[-2000] ^= 1
+    wal.write_bytes(content)
+    before = file.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(journal_file.os, 'replace', refuse)
+        one = Drive(tmp_path, written.config)
+    assert one.found.trouble != ''
+    assert len(path_of(one.backend).poses) > 50
+    assert 'no room' in one.journal.failure
+    one.checkpoint()
+    one.keep_path()
+    assert one.journal.failure == ''
+    one.journal.close(5.0)
+    assert before in [path.read_bytes() for path in tmp_path.glob('*.bad-*')]
+    assert opened(tmp_path).trouble == ''
+
+
+def refuse(*_: object) -> None:
+    raise OSError('no room')
+
+
+def test_another_file_that_is_put_there_is_set_aside(begun: Drive, tmp_path: Path) -> None:
+    (tmp_path / 'backup').write_bytes(b'of a person')
+    (tmp_path / 'backup').replace(begun.path)
+    driven(begun, 10)
+    begun.checkpoint()
+    driven(begun, 10)
+    assert b'of a person' in [path.read_bytes() for path in tmp_path.glob('*.bad-*')]
+    then = begun.killed()
+    np.testing.assert_array_equal(path_of(then.backend).poses, path_of(begun.backend).poses)
+    then.journal.close(5.0)
+
+
+@pytest.mark.parametrize('has_gap', [False, True])
+def test_what_waits_for_the_engine_at_a_checkpoint_is_in_the_log(
+    begun: Drive, has_gap: bool,
+) -> None:
+    if has_gap:
+        begun.journal._fail(OSError('no room'))
+    for k in range(50, 80):
+        begun.chapter.measured('odom', line_sample(1.0 + 0.1 * k))
+        if k < 60:
+            begun.backend.add_odometry(line_sample(1.0 + 0.1 * k), 'odom')
+    begun.chapter.taken += 10
+    begun.update()
+    begun.keep_path()
+    begun.checkpoint()
+    for k in range(80, 90):
+        begun.chapter.measured('odom', line_sample(1.0 + 0.1 * k))
+    then_at = path_of(begun.backend)
+    begun.journal.put_at_once(begun.chapter, then_at).wait(60.0)
+    then = begun.killed()
+    assert then.found.trouble == ''
+    assert [entry.number for entry in then.found.entries] == [*range(61, 91)]
     then.journal.close(5.0)
 
 
@@ -296,6 +379,56 @@ def test_a_chapter_with_a_state_replaces_the_one_before_with_its_first_checkpoin
     then = begun.killed()
     assert len(path_of(then.backend).poses) == length
     then.journal.close(5.0)
+
+
+def test_a_chapter_that_is_replaced_before_its_first_checkpoint_holds_nothing_up(
+    begun: Drive,
+) -> None:
+    replaced = begun.journal.begin(has_state=True)
+    replaced.measured('odom', line_sample(99.0))
+    begun.journal.put_at_once(begun.chapter, path_of(begun.backend)).wait(0.2)
+    begun.chapter, begun.backend = begun.journal.begin(), PoseGraphBackend(LINE_ODOMETRY)
+    driven(begun, 20)
+    then = begun.killed()
+    assert [entry.number for entry in then.found.entries if entry.act == 0] == [*range(1, 21)]
+    then.journal.close(5.0)
+
+
+def test_what_comes_while_a_graph_is_loaded_at_the_first_start_is_not_taken_for_a_drive(
+    tmp_path: Path,
+) -> None:
+    journal = Journal(tmp_path / 'state.db', PERIOD)
+    journal.take()
+    chapter = journal.begin(has_state=True)
+    chapter.measured('odom', line_sample(1.0))
+    journal.put_at_once(chapter, KnownPath()).wait(0.2)
+    journal.close(5.0)
+    assert opened(tmp_path).last == (0, 0)
+
+
+def test_a_path_from_before_the_alignment_is_not_put_on_the_map() -> None:
+    whole, path = PoseGraphBackend(LINE_ODOMETRY), KnownPath()
+    entries, rng = list[Entry](), np.random.default_rng(1)
+    T_map_odom, n_updates = np.array([500.0, -300.0, 2.8]), 0
+    for k in range(500):
+        pose = np.array([0.1 * k, 0.2 * np.sin(0.05 * k), 0.1 * np.cos(0.05 * k)])
+        events = [Event('odom', OdometrySample(k * 100_000_000, pose))]
+        if k > 200 and k % 10 == 0:
+            mean = se2.compose(T_map_odom, pose)[:2] + rng.normal(0.0, 0.5, 2)
+            events.append(Event('fix', Position(
+                k * 100_000_000, mean, 0.25 * np.eye(2), np.zeros(2))))
+        for event in events:
+            feed(whole, event)
+            entries.append(Entry(len(entries) + 1 - n_updates, 0, event.source, plain(event.what)))
+        if k % 2 == 1:
+            whole.update()
+            n_updates += 1
+            entries.append(Entry(len(entries) + 1 - n_updates, n_updates, 'update', []))
+        if k == 200:
+            path = path_of(whole)
+    assert whole.parts.alignment.is_aligned
+    again = recovered(LINE_ODOMETRY, Found(None, entries, path, (0, 0)), no_place)
+    np.testing.assert_allclose(path_of(again).poses, path_of(whole).poses, rtol=0, atol=1e-6)
 
 
 def test_a_checkpoint_of_a_drive_that_goes_on_is_written_like_the_first(tmp_path: Path) -> None:
