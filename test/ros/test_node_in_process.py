@@ -3,7 +3,7 @@
 """The managed node in the test's own process: its lifecycle, parameters and services."""
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 import json
 import math
@@ -73,6 +73,8 @@ class Managed(Driver):
 def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]:
     values = {'frequency': 50, 'diagnostics_period': 0.02, 'file_folder': str(tmp_path),
               **getattr(request, 'param', {})}
+    values = {name: value.replace('PATH', str(tmp_path)) if isinstance(value, str) else value
+              for name, value in values.items()}
     overrides = [Parameter(name, value=value) for name, value in values.items()]
 
     def make(context: Context) -> PoseGraphNode:
@@ -121,6 +123,7 @@ def test_parameters_may_be_whole_numbers_and_unknown_ones_are_warned_of(
     plane = managed.session.input.reader.datum.plane
     assert (plane.latitude, plane.longitude) == (48.0, 11.0)
     assert not node.has_parameter('fix.topic')
+    assert managed.call('set_datum').message == 'refused: it is given by the parameter datum'
 
 
 @pytest.mark.parametrize('managed', [{'diagnostics_period': 30.0}], indirect=True)
@@ -275,6 +278,32 @@ def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> 
     assert '4 fixes in the graph refer to the datum [48.' in answer.message
     datum.keep(PLANE.origin)
     assert 'graph that was loaded' in managed.call('set_datum').message
+
+
+@pytest.mark.parametrize('managed', [{'state_file': 'PATH/state.db'}], indirect=True)
+def test_the_map_of_a_journal_comes_back_after_a_reset_while_it_is_read(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.drive(3.0)
+    managed.wait(lambda: managed.session.worker.estimate is not None, 'there is a map')
+    managed.call('optimize')
+    n_nodes, node = managed.session.worker.estimate.n_hidden, managed.local.node
+    for trigger in (node.trigger_deactivate, node.trigger_cleanup):
+        assert trigger() is SUCCESS
+    reset, warm_up = threading.Event(), Session._warm_up
+
+    def slowly(session: Session, stopped: Callable[[], bool]) -> None:
+        reset.wait(PATIENCE)
+        warm_up(session, stopped)
+    monkeypatch.setattr(Session, '_warm_up', slowly)
+    managed.start()
+    managed.session.reset()
+    reset.set()
+    answer = managed.call('undo_reset')
+    assert answer.success, answer.message
+    managed.wait(lambda: managed.session.worker.estimate is not None, 'the map is back')
+    assert managed.session.worker.estimate.n_hidden == n_nodes
 
 
 def test_a_node_starts_with_a_graph(
