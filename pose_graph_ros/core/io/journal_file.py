@@ -149,7 +149,7 @@ class JournalFile:
         written, or there is no room for a copy, it is read all the same.
         """
         try:
-            self._claim()
+            self._claim(ENDING)
         except BlockingIOError:
             raise
         except OSError:     # which the first `write` will tell
@@ -234,12 +234,12 @@ class JournalFile:
             'INSERT INTO log (number, act, digest, content, moved) VALUES (?, ?, ?, ?, ?)',
             (*last, _digest(content + change), content, change))
 
-    def _claim(self) -> None:
+    def _claim(self, tries: int = 1) -> None:
         """Keep other processes from using the file, as long as this one does."""
         if self._lock is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             lock = self.path.with_name(self.path.name + '.lock').open('ab')
-            for left in range(ENDING - 1, -1, -1):
+            for left in range(tries - 1, -1, -1):
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     break
