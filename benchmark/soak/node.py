@@ -116,7 +116,7 @@ class Soak:
 
     def _restart(self) -> None:
         """Let the drive begin again."""
-        self.life = Life(1, 5.0, Datum(DATUM), seed=self._draw.randrange(1000))
+        self.life = Life(30, 5.0, Datum(DATUM), seed=self._draw.randrange(1000))
         self._events = itertools.chain.from_iterable(
             piece.events for piece in itertools.chain.from_iterable(
                 self.life.pieces() for _ in iter(int, 1)))

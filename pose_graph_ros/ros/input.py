@@ -437,4 +437,6 @@ class PoseContinuity:
                 self._jump_ns = sample.stamp_ns if jumped else 0
             else:
                 self._window = self._window.moved(sample.stamp_ns, self._pose, step)
-        return estimate is not None and estimate.stamp_ns >= self._jump_ns
+        # a map that was loaded may end hours after odometry that the engine refuses
+        return estimate is not None and estimate.stamp_ns >= self._jump_ns and not (
+            self._resumes and sample.stamp_ns < estimate.stamp_ns - FAR_NS)

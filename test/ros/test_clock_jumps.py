@@ -196,6 +196,14 @@ def test_no_estimate_is_propagated_over_a_jump_that_it_does_not_include() -> Non
     assert drive(continuity, (5.2, 0.2), newest=5.0) == [True]
 
 
+def test_a_map_that_was_loaded_is_not_propagated_to_odometry_of_hours_before() -> None:
+    continuity = PoseContinuity(60.0, resumes=True)
+    assert drive(continuity, (1.0, 0.0), (1.1, 0.1), newest=18_000.0) == [False, False]
+    continuity = PoseContinuity(60.0, resumes=True)
+    assert drive(continuity, (18_001.0, 0.0), newest=18_000.0) == [False]
+    assert drive(continuity, (18_001.1, 0.1), newest=18_001.0) == [True]
+
+
 def test_one_stamp_from_the_future_does_not_stop_the_output() -> None:
     continuity = PoseContinuity(60.0)
     assert drive(continuity, (1.0, 0.0), (1.1, 0.1), newest=1.1) == [True, True]
