@@ -157,5 +157,5 @@ def value_defect(value: FloatArray) -> str | None:
 
 
 def rejected(reason: str, detail: str = '') -> Answer:
-    """Return the answer that rejects an input."""
-    return Answer(AnswerStatus.REJECTED, reason, detail)
+    """Return the answer that rejects an input; its detail, which may quote that, is one line."""
+    return Answer(AnswerStatus.REJECTED, reason, ' '.join(detail.split()))
