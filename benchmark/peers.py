@@ -38,7 +38,7 @@ def stranger(environment: dict[str, str]) -> Iterator['subprocess.Popen[str]']:
     with subprocess.Popen([sys.executable, '-m', 'benchmark.stranger'], env=environment, text=True,
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        # Fast DDS may print lines of its own before, such as on ports of processes that were killed
+        # Fast DDS may print before, such as on ports of processes that were killed
         assert 'ready\n' in iter(process.stdout.readline, '')
         try:
             yield process

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not there
 def stranger(node: NodeProcess) -> Iterator['subprocess.Popen[str]']:
     with subprocess.Popen([sys.executable, '-m', 'benchmark.stranger'], env=node.env, text=True,
                           cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        # Fast DDS may print lines of its own before, such as on ports of processes that were killed
+        # Fast DDS may print before, such as on ports of processes that were killed
         assert 'ready\n' in iter(process.stdout.readline, '')
         try:
             yield process
