@@ -16,8 +16,12 @@ from pose_graph_ros import core
 
 PACKAGE = Path(pose_graph_ros.__file__).parent
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [page for page in (*ROOT.glob('*.md'), *ROOT.glob('docs/*.md')) if page.name != 'LICENSE']
+PAGES = sorted((*ROOT.glob('*.md'), *ROOT.glob('docs/**/*.md')))
 README_LINES = 110
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
 
 
 @functools.cache
@@ -37,43 +41,63 @@ def definitions() -> set[str]:
     return names
 
 
+def without_code(page: Path) -> str:
+    return re.sub(r'^```.*?^```', '', page.read_text(encoding='utf-8'), flags=re.M | re.S)
+
+
 def quoted(page: Path) -> list[str]:
     """Return what stands in backticks outside blocks of code."""
-    text = re.sub(r'^```.*?^```', '', page.read_text(encoding='utf-8'), flags=re.M | re.S)
-    return re.findall(r'`([^`\n]+)`', text)
+    return re.findall(r'`([^`\n]+)`', without_code(page))
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_files_that_are_named_exist(page: Path) -> None:
     for name in quoted(page):
         if re.fullmatch(r'[\w/{},]+/\w+\.py', name) is None:
             continue
         places = (ROOT, PACKAGE, PACKAGE / 'core')
-        assert any((place / name).is_file() for place in places), f'{page.name}: {name}'
+        assert any((place / name).is_file() for place in places), f'{name_of(page)}: {name}'
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_what_a_page_says_is_in_a_file_is_there(page: Path) -> None:
     text = page.read_text(encoding='utf-8')
     for name, module in re.findall(r'`([\w.]+)`\s(?:in\s|\()`([\w/]+\.py)`', text):
         files = [place / module for place in (ROOT, PACKAGE, PACKAGE / 'core')]
         found = next(file for file in files if file.is_file()).read_text(encoding='utf-8')
-        assert re.search(rf'\b{name.rpartition(".")[2]}\b', found), f'{page.name}: {name}'
+        assert re.search(rf'\b{name.rpartition(".")[2]}\b', found), f'{name_of(page)}: {name}'
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@functools.cache
+def anchors(page: Path) -> set[str]:
+    """Return what `#` may lead to: the headings, as GitHub makes anchors of them."""
+    names: list[str] = []
+    for title in re.findall(r'^#+ (.*)$', without_code(page), flags=re.M):
+        text = re.sub(r'\[([^]]*)\]\([^)]*\)', r'\1', title).lower()
+        name = re.sub(r'[^\w -]', '', text).replace(' ', '-')
+        names.append(f'{name}-{names.count(name)}' if name in names else name)
+    return set(names)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
-    for link in re.findall(r'\]\(([^)#]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8')):
-        if '://' not in link:
-            assert (page.parent / link).exists(), f'{page.name}: {link}'
+    text = re.sub(r'`[^`\n]+`', '', without_code(page))
+    for file, anchor in re.findall(r'\]\(([^)#\s]*)#?([^)\s]*)\)', text):
+        if '://' in file:
+            continue
+        target = page.parent / file if file else page
+        # a link to a folder shows its list of files on GitHub, and nothing in the site
+        assert target.is_file(), f'{name_of(page)}: {file}'
+        if anchor:
+            assert anchor in anchors(target), f'{name_of(page)}: {file}#{anchor}'
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_classes_and_their_members_that_are_named_exist(page: Path) -> None:
     names = definitions()
     for name in (quoted_name.removesuffix('()') for quoted_name in quoted(page)):
         if re.fullmatch(r'[A-Z][a-zA-Z]+\.[a-z_]+', name) and name.partition('.')[0] in names:
-            assert name in names, f'{page.name}: {name}'
+            assert name in names, f'{name_of(page)}: {name}'
 
 
 def test_the_stories_of_the_design_name_only_what_there_is() -> None:
@@ -131,7 +155,7 @@ def test_what_users_call_has_a_docstring() -> None:
                 if not one.__doc__ or one.__doc__.startswith(f'{one.__name__}(')]
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_tests_that_a_page_names_exist(page: Path) -> None:
     for file, name in re.findall(r'`(test/[\w/]+\.py)::(\w+)`', page.read_text(encoding='utf-8')):
         assert f'\ndef {name}(' in (ROOT / file).read_text(encoding='utf-8'), f'{file}::{name}'

@@ -190,7 +190,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--marginals', metavar='{all,newest,IDS}',
                         help='covariances of these nodes, such as 3,7,20:25, as CSV: the last '
                              'output, or -o FILE.csv (default, with such a file: all)')
-    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
+    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools/solve.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, '
                         'by comparing sets of them (selection, the default), or by graduated '
@@ -243,7 +243,7 @@ def draw(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--example', action='store_true', help='draw five states of a growing '
                         'graph, with --pattern, in place of a file')
     parser.add_argument('--json', action='store_true',
-                        help='print what is drawn as JSON (docs/tools.md)')
+                        help='print what is drawn as JSON (docs/tools/draw.md)')
 
 
 def marginalize(parser: argparse.ArgumentParser) -> None:
@@ -265,7 +265,8 @@ def marginalize(parser: argparse.ArgumentParser) -> None:
                         help='g2o file of the graph without them')
     parser.add_argument('--sparse', action='store_true',
                         help='write conservative edges in place of dense priors')
-    parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
+    parser.add_argument('--json', action='store_true',
+                        help='print JSON (docs/tools/marginalize.md)')
 
 
 def _add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:

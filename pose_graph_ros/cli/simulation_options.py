@@ -91,7 +91,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     out.add_argument('--plot', metavar='FILE', type=Path,
                      help=f'draw a map; the name ends in {", ".join(PICTURES)}')
     out.add_argument('--json', action='store_true', help='print what was simulated, the content '
-                     'of OUT_truth.json, as JSON (docs/tools.md)')
+                     'of OUT_truth.json, as JSON (docs/tools/simulate.md)')
 
 
 def _by_world(values: dict[str, float]) -> str:

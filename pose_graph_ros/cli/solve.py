@@ -44,7 +44,7 @@ MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kern
 
 
 Report = tuple[dict[str, Any], list[str]]
-"""What is said of the minimum: `certificate` in the JSON output, as in docs/tools.md; lines."""
+"""What is said of the minimum: `certificate` in the JSON output, docs/tools/solve.md; lines."""
 
 
 class Solution(NamedTuple):

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What run.json looks like, as docs/tools.md says it, and whether an object does."""
+"""What run.json looks like, as docs/tools/report.md says it, and whether an object does."""
 
 from collections.abc import Iterator, Mapping
 import math

@@ -3,7 +3,7 @@
 """
 The results of a run, of a replay as of a demo: files in a folder, and lines for people.
 
-What the page of `pose-graph report` shows is the JSON object in run.json, see docs/tools.md.
+What the page of `pose-graph report` shows is the JSON object in run.json: docs/tools/report.md.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
