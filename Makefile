@@ -23,7 +23,7 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench soak lint types fmt \
+.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench soak docs lint types fmt \
 	lock clean
 
 help:
@@ -37,6 +37,7 @@ help:
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make soak    a month through the engine and an hour through the node: hours, at low priority;'
 	@echo '             [SOAK_DAYS=30] [SOAK_HOURS=5 a day] [SOAK_MINUTES=60] [SOAK_OUT=build/soak]'
+	@echo 'make docs    the pages of docs/ as a site: build/docs/index.html'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
 	@echo '             compiles the solver'
@@ -85,6 +86,16 @@ soak: setup
 	@nice $(VENV)/bin/python -m benchmark.soak node --minutes $(SOAK_MINUTES) -o $(SOAK_OUT)
 	@$(VENV)/bin/python -m benchmark.soak page -o $(SOAK_OUT)
 
+# in an environment of its own: the site needs nothing of the package, and no ROS
+docs: .venv-docs/bin/sphinx-build
+	@$< --quiet --fail-on-warning --keep-going -c docs -d build/docs_trees . build/docs
+	@echo 'build/docs/index.html'
+
+.venv-docs/bin/sphinx-build: docs/requirements.txt
+	@$(or $(PYTHON),python3) -m venv --clear .venv-docs
+	@.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r $<
+	@touch $@
+
 lint: setup-test
 	$(VENV)/bin/ruff check
 
@@ -101,8 +112,9 @@ lock: setup
 		| grep -vxF -f requirements.lock \
 		| sed '1i # What tests and checks need beside requirements.lock; made by `make lock`.' \
 		>requirements-test.lock
+	$(RESOLVE) dev/requirements-docs.in -o docs/requirements.txt
 
 clean:
-	rm -rf .venv .venv-ros build install log *.egg-info .coverage htmlcov
+	rm -rf .venv .venv-ros .venv-docs build install log *.egg-info .coverage htmlcov
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find pose_graph_ros test launch -name __pycache__ -prune -exec rm -rf {} +

@@ -159,3 +159,11 @@ def test_what_users_call_has_a_docstring() -> None:
 def test_tests_that_a_page_names_exist(page: Path) -> None:
     for file, name in re.findall(r'`(test/[\w/]+\.py)::(\w+)`', page.read_text(encoding='utf-8')):
         assert f'\ndef {name}(' in (ROOT / file).read_text(encoding='utf-8'), f'{file}::{name}'
+
+
+def test_the_list_beside_the_pages_of_the_site_has_each_of_them() -> None:
+    text = (ROOT / 'docs' / 'conf.py').read_text(encoding='utf-8')
+    parts = ast.literal_eval(re.search(r'^PARTS = ({.*?})$', text, flags=re.M | re.S)[1])
+    listed = [re.sub(r'.*<(.*)>', r'\1', name) for names in parts.values() for name in names]
+    pages = {page.relative_to(ROOT).with_suffix('') for page in ROOT.glob('docs/**/*.md')}
+    assert not {page for page in pages if not any(page.match(name) for name in listed)}
