@@ -118,7 +118,7 @@ def modules(*parts: str) -> list[Path]:
 
 def test_every_package_is_looked_at() -> None:
     assert {path.parts[0] for path in MODULES} == {
-        'core', 'offline', 'adapters', 'ros', 'cli', '__init__.py'}
+        'core', 'offline', 'adapters', 'ros', 'cli', 'examples', '__init__.py'}
     inside = {package_of('.'.join(path.with_suffix('').parts)) for path in modules('core')}
     assert inside == {*CORE, *BASE, *TOP, 'core.__init__'}
     tools = {package_of('.'.join(path.with_suffix('').parts)) for path in modules('offline')}
@@ -183,6 +183,10 @@ def test_adapters_node_and_tools_import_nothing_above_them() -> None:
     above = {'adapters': {'ros', 'cli', *OFFLINE}, 'ros': {'cli', *OFFLINE}, 'cli': {'ros'}}
     assert not [(path, found) for folder, names in above.items() for path in modules(folder)
                 if (found := own_imports(path) & names)]
+
+
+def test_examples_can_be_copied_out_of_the_package() -> None:
+    assert not [(path, found) for path in modules('examples') if (found := own_imports(path))]
 
 
 def test_a_fresh_interpreter_has_no_rclpy_after_an_import() -> None:

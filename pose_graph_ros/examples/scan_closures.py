@@ -1,0 +1,132 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A small front end: it sends a loop closure where a laser scan matches one of before.
+
+    python3 -m pose_graph_ros.examples.scan_closures --ros-args -r scan:=/front/scan
+
+`match` compares two scans; the rest is what any front end does for the node, see
+docs/guides/loop_closures.md. Copy it, and put your own matching into its place.
+"""
+
+import math
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Path
+import numpy as np
+from numpy.typing import NDArray
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
+from scipy.spatial import cKDTree
+from sensor_msgs.msg import LaserScan
+
+FloatArray = NDArray[np.float64]
+PERIOD, LAP = 1.0, 20.0     # between scans that are kept; to one that may be the same place [s]
+NEARBY, REACH = 3.0, 1.0    # between poses to compare; between points to match at the end [m]
+OFF, SHARE = 0.1, 0.8       # how far points may be off their lines [m]; how many must not be
+FLOOR = np.diag((0.03, 0.03, 0.005)) ** 2   # errors that all points share [m, m, rad]
+
+
+class ScanClosures(Node):
+    """Keeps scans, and compares each with the nearest of earlier visits."""
+
+    def __init__(self) -> None:
+        super().__init__('scan_closures')
+        self._mounting = self.declare_parameter('laser', [0.0, 0.0, 0.0]).value  # in base_link
+        self._scans: list[tuple[int, FloatArray]] = []  # stamps [ns], points in base_link [m]
+        self._next = 0                                  # of these, which is compared next
+        self._closures = self.create_publisher(PoseWithCovarianceStamped, 'loop_closure', 100)
+        self.create_subscription(LaserScan, 'scan', self._keep, qos_profile_sensor_data)
+        self.create_subscription(Path, 'path', self._compare, 1)
+
+    def _keep(self, scan: LaserScan) -> None:
+        stamp = Time.from_msg(scan.header.stamp).nanoseconds
+        if len(self._scans) > 0 and stamp - self._scans[-1][0] < PERIOD * 1e9:
+            return
+        ranges = np.asarray(scan.ranges, dtype=float)
+        angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))
+        hit = (ranges > scan.range_min) & (ranges < scan.range_max)
+        points = ranges[hit, None] * np.stack((np.cos(angles), np.sin(angles)), axis=1)[hit]
+        self._scans.append((stamp, move(np.array(self._mounting), points)))
+
+    def _compare(self, path: Path) -> None:
+        """Compare the scans that the path has come to, where it now says that they were taken."""
+        if len(path.poses) == 0:
+            return
+        at = [Time.from_msg(item.header.stamp).nanoseconds for item in path.poses]
+        poses = np.array([(item.pose.position.x, item.pose.position.y, 2.0 * math.atan2(
+            item.pose.orientation.z, item.pose.orientation.w)) for item in path.poses])
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        stamps = np.array([stamp for stamp, _ in self._scans])
+        places = np.stack([np.interp(stamps, at, column) for column in poses.T], axis=1)
+        while self._next < len(stamps) and stamps[self._next] <= at[-1]:
+            new, self._next = self._next, self._next + 1
+            apart = np.hypot(*(places[:new, :2] - places[new, :2]).T)
+            apart[stamps[:new] > stamps[new] - LAP * 1e9] = math.inf
+            if len(apart) > 0 and apart[old := int(np.argmin(apart))] < NEARBY:
+                x, y, yaw = places[old]
+                there = move(np.array((0.0, 0.0, -yaw)), places[new:new + 1, :2] - (x, y))[0]
+                found = match(self._scans[new][1], self._scans[old][1],
+                              np.array((*there, places[new, 2] - yaw)))
+                if found is not None:
+                    self._send(int(stamps[new]), int(stamps[old]), *found)
+
+    def _send(self, new: int, old: int, pose: FloatArray, covariance: FloatArray) -> None:
+        """Say where the robot was at stamp `new`, in the frame of where it was at `old`."""
+        message = PoseWithCovarianceStamped()
+        message.header.stamp = Time(nanoseconds=new).to_msg()
+        message.header.frame_id = f'@{old // 10**9}.{old % 10**9:09d}'
+        message.pose.pose.position.x, message.pose.pose.position.y = pose[:2].tolist()
+        message.pose.pose.orientation.z = math.sin(pose[2] / 2.0)
+        message.pose.pose.orientation.w = math.cos(pose[2] / 2.0)
+        full = np.zeros((6, 6))
+        full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance     # x, y and yaw
+        message.pose.covariance = full.ravel().tolist()
+        self._closures.publish(message)
+
+
+def move(pose: FloatArray, points: FloatArray) -> FloatArray:
+    """Return points that are given in the frame of a pose in that of the pose itself."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return points @ np.array(((c, s), (-s, c))) + pose[:2]
+
+
+def match(
+    points: FloatArray, target: FloatArray, pose: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the pose of one scan in another, with its covariance, by point-to-line ICP."""
+    along = np.roll(target, -2, axis=0) - np.roll(target, 2, axis=0)
+    normals = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.hypot(*along.T)[:, None]
+    tree = cKDTree(target)
+    for iteration in range(30):
+        moved = move(pose, points)
+        apart, nearest = map(np.asarray, tree.query(moved))
+        near = apart < max(REACH, 4.0 * 0.8 ** iteration)
+        n, arm = normals[nearest[near]], moved[near] - pose[:2]
+        error = np.sum(n * (moved[near] - target[nearest[near]]), axis=1)
+        J = np.column_stack((n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]))
+        # what the points do not tell, such as the place along a corridor, stays as it was guessed,
+        H = J.T @ J + 1e-6 * np.eye(3)
+        pose = pose - np.linalg.solve(H, J.T @ error)
+    if np.sum(np.abs(error) < OFF) < SHARE * len(points):
+        return None
+    # and gets a large variance
+    return pose, np.mean(error ** 2) * np.linalg.inv(H) + FLOOR
+
+
+def main() -> None:
+    """Run the node until it is interrupted."""
+    rclpy.init()
+    try:
+        rclpy.spin(ScanClosures())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()
