@@ -140,6 +140,31 @@ def tune(parser: argparse.ArgumentParser) -> None:
     _add_parameters(parser)
 
 
+def migrate(parser: argparse.ArgumentParser) -> None:
+    """
+    Make a parameter file of those of robot_localization, fuse or slam_toolbox.
+
+    The files are those of ekf_node, ukf_node and navsat_transform_node, of fuse's
+    fixed_lag_smoother or of slam_toolbox, of ROS 2 or ROS 1; give all of a robot at once. Each
+    value has a comment that says where it is from. Below stand what is left to do, the call of the
+    launch file, and what became of each parameter: taken, not needed, changed, without a
+    counterpart, or not known.
+
+    examples:
+      pose-graph migrate dual_ekf_navsat_params.yaml                  # to the screen
+      pose-graph migrate ekf.yaml navsat_transform.yaml -o pose_graph.yaml
+
+    exit code: 0 made, 2 wrong input
+    """
+    parser.add_argument('files', metavar='FILE', type=Path, nargs='+', help='parameter file')
+    parser.add_argument('-o', '--out', metavar='FILE', type=Path,
+                        help='parameter file to write (default: standard output)')
+    parser.add_argument('--force', action='store_true', help='overwrite the file of -o')
+    parser.add_argument('--replace-local', action='store_true', help='replace a filter in the '
+                        'odometry frame as well; the driver of the wheels must then publish the '
+                        'transform from there to the robot')
+
+
 def parameters(parser: argparse.ArgumentParser) -> None:
     """Print the parameters of the node, as tables or as a parameter file."""
     parser.add_argument('--yaml', action='store_true', help='print them as a parameter file')

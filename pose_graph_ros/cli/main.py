@@ -30,6 +30,7 @@ SUMMARIES = {
     'draw': 'draw a small graph as SVG or PNG',
     'marginalize': 'take nodes out of a graph, and keep what they told',
     'tune': 'estimate the noise of the sources from bags; write a parameter file',
+    'migrate': 'make a parameter file of those of robot_localization, fuse, slam_toolbox',
     'simulate': 'write a simulated drive as a rosbag2 or a graph',
     'parameters': 'print the parameters of the node',
     'compile-kernels': 'compile the solver for later starts'}
