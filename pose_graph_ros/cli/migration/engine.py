@@ -108,7 +108,7 @@ class Migration:
                 self.names[one][kind] = name
         if self.kept is not None and own is None:
             named.append('odom')
-        moving = [name for name in named if KINDS[self._type(name)].is_odometry]
+        moving = [name for name in named if KINDS[self.type_of(name)].is_odometry]
         others = [name for name in named if name not in moving]
         if len(navsats) > 0 and 'fix' not in named:
             others.append('fix')
@@ -146,11 +146,16 @@ class Migration:
             self._set(f'{name}.integrate', 'twist', f'{use}: velocities')
         if kind == 'global_pose' and 'yaw' not in one.uses:
             self._set(f'{name}.heading', 'never', f'{use}: no yaw')
+        if kind == 'imu':
+            self._set(f'{name}.correlation_time', 600.0, 'what a compass is wrong by lasts, so it '
+                      'is estimated and bends no path')
+            self._set(f'{name}.sigma_floor', [0.01, 0.1], 'how much that may be [m, rad]')
         for navsat in self.of(System.NAVSAT) if kind == 'imu' else []:
             if (angle := sum(float(navsat.values.get(part, 0.0)) for part in ANGLES)) != 0.0:
                 self._set(f'{name}.yaw_offset', round(angle, 9), place(navsat, *ANGLES))
 
-    def _type(self, source: str) -> str:
+    def type_of(self, source: str) -> str:
+        """Return the type of a source, which is given or usual for its name."""
         given = self.settings.get(f'{source}.type')
         return str(given.value) if given is not None else KNOWN_SOURCES[source][0].name
 
@@ -171,7 +176,7 @@ class Migration:
                 self._note(section, name, Fate.UNKNOWN, 'of a node that is none of these systems')
             elif section.system is System.FILTER and section is not self.replaced and not (
                     self.replaced is None and name in parameters.FRAMES):
-                self._note(section, name, Fate.NOT_NEEDED, 'stays as it is, in a filter that stays'
+                self._note(section, name, Fate.NOT_NEEDED, 'unchanged, in the filter that stays'
                            if section is self.kept else 'of a filter that is not needed any more')
             elif section.system is not System.NAVSAT or not self._judge_angle(
                     section, name, value):

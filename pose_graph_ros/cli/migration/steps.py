@@ -7,6 +7,7 @@ from pathlib import Path
 import shlex
 
 from pose_graph_ros.adapters.parameters import FRAMES
+from pose_graph_ros.adapters.sources import KINDS
 from pose_graph_ros.cli.migration.engine import GLOBAL, Migration
 from pose_graph_ros.cli.migration.files import in_map, Section, System
 from pose_graph_ros.cli.migration.inputs import plugins
@@ -35,8 +36,8 @@ def steps(migration: Migration) -> Iterator[str]:
     elif replaced is not None and _publishes_odometry(replaced):
         yield (f'Let the driver of the wheels publish {lower}, which {replaced.node} did. This '
                f'node does not: its corrections are in {upper}. Or keep {replaced.node} for that, '
-               'without inputs that know the map, such as GNSS, with its output as odom.topic and '
-               'without the sources that it uses itself.')
+               'without inputs that know the map, such as GNSS; then write its output to '
+               'odom.topic, and take imu and gyro out of sources, as it has them.')
     else:
         yield (f'Another node has to publish {lower}, such as the driver of the wheels. If a '
                'filter of robot_localization does, give its file as well.')
@@ -45,18 +46,21 @@ def steps(migration: Migration) -> Iterator[str]:
             yield (f'The yaw of {one.topic} was not used before and is now: if it is bad, set '
                    f'{names["odometry"]}.sigma_heading_turn to 1, so that others decide.')
         if 'imu' in names:
-            twice = ('. It is in the odometry, too: without a good compass take it out of sources'
-                     if migration.hears(one) else '')
-            yield (f'{one.topic}: its yaw is used as it is, 0 in the east. If the IMU is turned '
-                   f'on the robot, add that to {names["imu"]}.yaw_offset{twice}.')
+            yield (f'The yaw of {one.topic} is used as it is, 0 in the east, whatever /tf_static '
+                   'says: if the IMU is turned on the robot, add that to '
+                   f'{names["imu"]}.yaw_offset. It tells where the robot heads before it has '
+                   'driven; without a compass that does, take it out of sources.')
     if 'fix.topic' in settings:
         yield ('fix.topic is the usual name of what navsat_transform_node listens to: look for a '
                'remap of gps/fix. The place of the antenna is taken from /tf_static, or set '
                'fix.lever_arm.')
     if len(migration.of(System.SLAM_TOOLBOX)) > 0:
-        yield (f'This node matches no scans. Let slam_toolbox or another front end send loop '
-               'closures to the topic loop_closure, or give its topic pose as source global_pose. '
-               f'Only one node may publish {upper}.')
+        yield ('This node matches no scans. Let a front end send loop closures to the topic '
+               'loop_closure, or use the topic pose of slam_toolbox (global_pose in sources, '
+               f'global_pose.topic: pose). Only one node may publish {upper}.')
+    elif not any(KINDS[migration.type_of(name)].in_map for name in settings['sources'].value):
+        yield ('Nothing tells where the robot is in the map: add fix or global_pose to sources. '
+               'Loop closures are always listened to, on the topic loop_closure.')
     if settings['sources'].value[0] == 'odom' and 'no file' in settings['odom.topic'].why:
         yield 'Write the topic of the odometry to odom.topic: no file tells it.'
 

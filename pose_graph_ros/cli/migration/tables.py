@@ -152,7 +152,7 @@ SLAM_TOOLBOX = (
     Rule('map_start_pose|map_start_at_dock', CHANGED, SET_POSE),
     Rule('mode|localization_on_configure|lifelong_.*', CHANGED, 'there is one mode, in which a '
          'loaded graph goes on; thinning.cell holds its size where places are driven often'),
-    Rule('ceres_loss_function', TAKEN, 'of loop closures; odometry needs none',
+    Rule('ceres_loss_function', TAKEN, 'odometry needs none',
          'loop_closure.robust_loss', lambda value: {'HuberLoss': 'huber', 'CauchyLoss': 'cauchy'}
          .get(value, 'none')),
     Rule('solver_plugin|ceres_.*', NOT_NEEDED, 'the solver is incremental and has no settings'),
