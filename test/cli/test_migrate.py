@@ -125,8 +125,9 @@ def test_the_filter_that_publishes_odometry_stays_and_is_heard_once(tmp_path) ->
     ({'twist0': 'speed', 'twist0_config': config('vx', 'vy', 'vyaw')},
      {'sources': ['twist0'], 'twist0.type': 'twist', 'twist0.topic': 'speed'}),
     ({**WHEELS, **GNSS}, {'sources': ['odom', 'fix'], 'fix.topic': 'gps/fix'}),
-    # a pose in the map as odometry is none
+    # neither a pose in the map as odometry is odometry, nor a yaw rate
     ({**WHEELS, 'odom1': 'slam', 'odom1_config': config('x', 'y', 'yaw')}, {'sources': ['odom']}),
+    ({**WHEELS, 'odom1': 'rate', 'odom1_config': config('vyaw')}, {'sources': ['odom']}),
 ])
 def test_what_is_used_of_an_input_tells_its_type(tmp_path, inputs, expected) -> None:
     values, _ = migrated(tmp_path, {'node': ekf('map', **inputs)})
@@ -234,6 +235,11 @@ def test_what_cannot_be_migrated_is_said_in_one_line(tmp_path, capsys, text, sai
     assert len(lines) == 1
     assert said in lines[0]
     assert not (tmp_path / 'out.yaml').exists()
+
+
+def test_the_launch_call_has_namespace_and_clock_of_the_nodes(tmp_path) -> None:
+    _, text = migrated(tmp_path, {'/robot_1/ekf': {'use_sim_time': True, **ekf('map', **WHEELS)}})
+    assert 'compatible:=robot_localization namespace:=robot_1 use_sim_time:=true' in text
 
 
 def test_a_file_is_overwritten_only_by_force(tmp_path, capsys) -> None:

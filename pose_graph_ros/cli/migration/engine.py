@@ -193,7 +193,7 @@ class Migration:
         names = self.names[one]
         keys = [key for key in (one.topic_key, f'sensor_models.{one.name}.type', *one.use_keys)
                 if key in one.section.values]
-        fate, why = Fate.NONE, f'{one.topic} {of.UNUSED[one.message]}'
+        fate, why = Fate.NONE, f'{one.topic} {one.why_unused}'
         if len(names) > 0:
             fate, why = Fate.TAKEN, 'source ' + ' and '.join(names.values())
         elif self.kept is not None and self.hears(one) and one.uses & PLANAR:
@@ -244,7 +244,7 @@ class Migration:
 
 def _rule(system: System, plugins: dict[str, str], name: str, value: Any) -> Rule:
     """Return what becomes of a parameter that is of no input."""
-    model = re.fullmatch(r'sensor_models\.(.+)\.type', name)
+    model = re.fullmatch(r'(?:sensor_models|publishers)\.(.+)\.type', name)
     owner = model[1] if model else next(
         (each for each in plugins if name.startswith(f'{each}.')), '')
     return tables.rule_of(RULES[system] if owner == '' else tables.PLUGINS.get(

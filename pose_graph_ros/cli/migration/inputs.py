@@ -13,6 +13,7 @@ STATE = ('x', 'y', 'z', 'roll', 'pitch', 'yaw', 'vx', 'vy', 'vz', 'vroll', 'vpit
 """What the places of a configuration of robot_localization stand for."""
 PLANAR = {'x', 'y', 'yaw', 'vx', 'vy', 'vyaw'}
 VELOCITIES = {'vx', 'vy', 'vyaw'}
+WAY = {'x', 'y', 'vx', 'vy'}
 OF_FUSE = {'Odometry2D': 'odom', 'Imu2D': 'imu', 'Pose2D': 'pose', 'Twist2D': 'twist'}
 DIMENSIONS = {'position_dimensions': '', 'orientation_dimensions': '', 'dimensions': 'a',
               'linear_velocity_dimensions': 'v', 'angular_velocity_dimensions': 'v',
@@ -44,6 +45,11 @@ class Input:
     use_keys: tuple[str, ...]
     uses: frozenset[str]  # of `STATE`
     moves: bool  # whether only differences count
+
+    @property
+    def why_unused(self) -> str:
+        """Why it became no source, and what to do."""
+        return UNUSED[self.message if self.message != 'odom' or self.uses & WAY else 'twist']
 
     @property
     def positions_only(self) -> bool:
@@ -101,10 +107,11 @@ def kinds_of(one: Input, every: Collection[Input], *, in_map: bool, with_fixes: 
                 each.is_gnss for each in every)):
             return ['fix']
         case 'odom':
-            # beside odometry with velocities, a pose that counts as it is is one in the map
+            # beside other odometry, a pose that counts as it is is one in the map
             is_absolute = in_map and not one.moves and not uses & VELOCITIES and any(
-                each.uses & VELOCITIES for each in every if each.message in ('odom', 'twist'))
-            return [] if is_absolute or len(uses) == 0 else ['odometry']
+                each.uses & VELOCITIES or each.moves for each in every
+                if each.message in ('odom', 'twist') and each is not one)
+            return ['odometry'] if uses & WAY and not is_absolute else []
         case 'twist':
             return ['twist'] if 'vx' in uses else []
         case 'pose':

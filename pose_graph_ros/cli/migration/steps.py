@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+import re
 import shlex
 
 from pose_graph_ros.adapters.parameters import FRAMES
@@ -72,6 +73,10 @@ def launch_call(migration: Migration, out: Path) -> str:
         words.append('compatible:=robot_localization')
     if migration.kept is not None:
         words.append(f'filtered_odometry:={GLOBAL}')
+    spaces = {each.node.rpartition('/')[0].strip('/') for each in migration.sections
+              if each.system is not None}
+    if len(spaces) == 1 and re.fullmatch(r'[\w/]+', space := min(spaces)):
+        words.append(f'namespace:={space}')
     if any(each.values.get('use_sim_time') is True for each in migration.sections):
         words.append('use_sim_time:=true')
     return shlex.join(['ros2', 'launch', 'pose_graph_ros', 'pose_graph.launch.py', *words])

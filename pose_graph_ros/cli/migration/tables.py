@@ -182,7 +182,6 @@ FUSE = (
     Rule('solver_options.*', NOT_NEEDED, 'the solver is incremental and has no settings'),
     Rule('reset_service', CHANGED, 'the service is ~/reset'),
     Rule(r'motion_models.*', NOT_NEEDED, 'odometry stands for a motion model'),
-    Rule(r'publishers\..*\.type', TAKEN, 'see what it publishes'),
     Rule(r'sensor_models\..*\.(motion_models|ignition)', NOT_NEEDED,
          'there is no motion model, and a graph begins by itself'),
 )
@@ -204,6 +203,7 @@ INPUT_OF_FUSE = (
     Rule('.*:(remove_gravitational_acceleration|gravitational_acceleration|'
          'linear_acceleration_.*|acceleration_.*)', NONE, GRAVITY),
 )
+OUTPUT = Rule('type', TAKEN, 'an output of this node')
 PLUGINS = {
     'Unicycle2D': (
         Rule('process_noise_diagonal|scale_process_noise|velocity_norm_min', CHANGED, NOISE),
@@ -220,6 +220,7 @@ PLUGINS = {
     'Transaction': (Rule('.*', NONE, 'constraints of others come as loop closures'),),
     'Acceleration2D': (Rule('.*', NONE, GRAVITY),),
     'Odometry2DPublisher': (
+        OUTPUT,
         Rule('topic', TAKEN, target='outputs.filtered_odometry'),
         Rule('map_frame_id', TAKEN, target='map_frame'),
         Rule('odom_frame_id', TAKEN, target='odom_frame'),
@@ -232,10 +233,12 @@ PLUGINS = {
         Rule('invert_tf', NONE, 'the transform is map_frame -> odom_frame', value=True),
         Rule('.*', NOT_NEEDED, 'a covariance comes with every pose, without a setting')),
     'Path2DPublisher': (
+        OUTPUT,
         Rule('topic', TAKEN, target='outputs.path'),
         Rule('frame_id', TAKEN, target='map_frame'),
         Rule('.*', NOT_NEEDED, 'path_period bounds how often')),
     'Pose2DPublisher': (
+        OUTPUT,
         Rule('topic', TAKEN, target='outputs.pose'),
         Rule('.*', CHANGED, 'see the other publisher: frames are the same for all outputs')),
     'SerializedPublisher': (Rule('.*', NONE, '~/save_graph writes the graph as g2o'),),

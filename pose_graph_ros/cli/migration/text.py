@@ -28,7 +28,7 @@ def parameter_file(migration: Migration, out: Path, words: Sequence[str]) -> str
         group, _, leaf = name.rpartition('.')
         text = yaml.safe_dump([setting.value], default_flow_style=True, width=math.inf)
         groups.setdefault(group, []).append(f'{leaf}: {text.strip()[1:-1]}'.ljust(
-            38 if group == '' else 36) + f'# {setting.why}')
+            36 if group == '' else 34) + f'  # {setting.why}')
     for group, own in groups.items():
         lines += [f'    {line}' for line in own] if group == '' else [
             f'    {group}:', *(f'      {line}' for line in own)]
