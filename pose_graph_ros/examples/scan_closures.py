@@ -9,12 +9,13 @@ A small front end: it sends a loop closure where a laser scan matches one of bef
 docs/guides/loop_closures.md. Copy it, and put your own matching into its place.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
 import math
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 import numpy as np
-from numpy.typing import NDArray
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -23,7 +24,6 @@ from rclpy.time import Time
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import LaserScan
 
-FloatArray = NDArray[np.float64]
 PERIOD, LAP = 1.0, 20.0     # between scans that are kept; to one that may be the same place [s]
 NEARBY, REACH = 3.0, 1.0    # between poses to compare; between points to match at the end [m]
 OFF, SHARE = 0.1, 0.8       # how far points may be off their lines [m]; how many must not be
@@ -36,7 +36,7 @@ class ScanClosures(Node):
     def __init__(self) -> None:
         super().__init__('scan_closures')
         self._mounting = self.declare_parameter('laser', [0.0, 0.0, 0.0]).value  # in base_link
-        self._scans: list[tuple[int, FloatArray]] = []  # stamps [ns], points in base_link [m]
+        self._scans: list[tuple[int, np.ndarray]] = []  # stamps [ns], points in base_link [m]
         self._next = 0                                  # of these, which is compared next
         self._closures = self.create_publisher(PoseWithCovarianceStamped, 'loop_closure', 100)
         self.create_subscription(LaserScan, 'scan', self._keep, qos_profile_sensor_data)
@@ -49,8 +49,8 @@ class ScanClosures(Node):
         ranges = np.asarray(scan.ranges, dtype=float)
         angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))
         hit = (ranges > scan.range_min) & (ranges < scan.range_max)
-        points = ranges[hit, None] * np.stack((np.cos(angles), np.sin(angles)), axis=1)[hit]
-        self._scans.append((stamp, move(np.array(self._mounting), points)))
+        points = (ranges * (np.cos(angles), np.sin(angles))).T[hit]
+        self._scans.append((stamp, move(self._mounting, points)))
 
     def _compare(self, path: Path) -> None:
         """Compare the scans that the path has come to, where it now says that they were taken."""
@@ -68,13 +68,12 @@ class ScanClosures(Node):
             apart[stamps[:new] > stamps[new] - LAP * 1e9] = math.inf
             if len(apart) > 0 and apart[old := int(np.argmin(apart))] < NEARBY:
                 x, y, yaw = places[old]
-                there = move(np.array((0.0, 0.0, -yaw)), places[new:new + 1, :2] - (x, y))[0]
-                found = match(self._scans[new][1], self._scans[old][1],
-                              np.array((*there, places[new, 2] - yaw)))
-                if found is not None:
+                there = move((0.0, 0.0, -yaw), places[new, :2] - (x, y))
+                if (found := match(self._scans[new][1], self._scans[old][1],
+                                   np.append(there, places[new, 2] - yaw))) is not None:
                     self._send(int(stamps[new]), int(stamps[old]), *found)
 
-    def _send(self, new: int, old: int, pose: FloatArray, covariance: FloatArray) -> None:
+    def _send(self, new: int, old: int, pose: np.ndarray, covariance: np.ndarray) -> None:
         """Say where the robot was at stamp `new`, in the frame of where it was at `old`."""
         message = PoseWithCovarianceStamped()
         message.header.stamp = Time(nanoseconds=new).to_msg()
@@ -88,18 +87,16 @@ class ScanClosures(Node):
         self._closures.publish(message)
 
 
-def move(pose: FloatArray, points: FloatArray) -> FloatArray:
-    """Return points that are given in the frame of a pose in that of the pose itself."""
+def move(pose: Sequence[float] | np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return points that are given in the frame of a pose in the frame that this is given in."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return points @ np.array(((c, s), (-s, c))) + pose[:2]
 
 
-def match(
-    points: FloatArray, target: FloatArray, pose: FloatArray,
-) -> tuple[FloatArray, FloatArray] | None:
+def match(points: np.ndarray, target: np.ndarray, pose: np.ndarray) -> tuple | None:
     """Return the pose of one scan in another, with its covariance, by point-to-line ICP."""
     along = np.roll(target, -2, axis=0) - np.roll(target, 2, axis=0)
-    normals = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.hypot(*along.T)[:, None]
+    normals = along[:, ::-1] * (-1.0, 1.0) / np.hypot(*along.T)[:, None]
     tree = cKDTree(target)
     for iteration in range(30):
         moved = move(pose, points)
@@ -111,7 +108,7 @@ def match(
         # what the points do not tell, such as the place along a corridor, stays as it was guessed,
         H = J.T @ J + 1e-6 * np.eye(3)
         pose = pose - np.linalg.solve(H, J.T @ error)
-    if np.sum(np.abs(error) < OFF) < SHARE * len(points):
+    if np.sum(np.abs(error) < OFF) <= SHARE * len(points):
         return None
     # and gets a large variance
     return pose, np.mean(error ** 2) * np.linalg.inv(H) + FLOOR
@@ -120,12 +117,8 @@ def match(
 def main() -> None:
     """Run the node until it is interrupted."""
     rclpy.init()
-    try:
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(ScanClosures())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
 
 
 if __name__ == '__main__':
