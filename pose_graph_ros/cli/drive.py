@@ -12,7 +12,6 @@ its map may begin elsewhere, as where only a part of a recording is replayed.
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,9 +20,9 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.bags import Bag, BagError, Inputs, MessageError, reader_of
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
+from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
+from pose_graph_ros.adapters.sources import MessageReader
+from pose_graph_ros.cli.truth import path_of, Truth, UNKNOWN
 from pose_graph_ros.core import measurements as kinds
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
@@ -34,9 +33,6 @@ from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.quantities import StampNs
 
-MOST_SAMPLES = 200_000  # of a path that are compared and drawn
-POSE = 'geometry_msgs/msg/PoseStamped'
-POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
           State.DOUBTED.value, 'refused', 'held out')
 BELIEVED, WEAKLY_BELIEVED, WAITING, DOUBTED, REFUSED, HELD_OUT = range(len(STATES))
@@ -62,7 +58,7 @@ class Drive:
 
     odometry: Trajectory  # raw, `T_odom_base`
     corrected: Trajectory  # result, `T_map_base`
-    truth: Trajectory | None  # `T_map_base`; None if unknown
+    truth: Trajectory | None  # `T_map_base`, headings may be NaN; None if unknown
     fix_stamps_ns: IntArray  # (M,)
     fix_positions: Points  # in the map, (M, 2)
     fix_states: IntArray  # numbers of `STATES`, (M,)
@@ -108,7 +104,7 @@ class Drive:
                     ('fixes', truth, (self.fix_stamps_ns[~doubted], self.fix_positions[~doubted])),
                     ('doubted fixes', truth, of_kind['doubted']), ('corrected path', path, true)):
                 rows += error_rows(f'{name} to truth', distances(one, *other)[1])
-            inside = path.covers(truth.stamps_ns)
+            inside = path.covers(truth.stamps_ns) & np.isfinite(truth.poses[:, 2])
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(se2.wrap(
                 path.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2]))), 'deg')
         for kind in ('used', 'doubted', 'held out'):
@@ -117,16 +113,16 @@ class Drive:
         return rows
 
 
-def place_truth(drive: Drive) -> Drive:
-    """Return a drive with the truth moved rigidly to where it fits the corrected path best."""
-    truth = drive.truth
-    if truth is None or not np.any(inside := drive.corrected.covers(truth.stamps_ns)):
+def place_truth(drive: Drive, truth: Truth = UNKNOWN) -> Drive:
+    """Return a drive with its truth where that is compared with the corrected path."""
+    if drive.truth is None:
         return drive
-    before = truth.poses[inside, :2]
-    pose = fit_motion(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2])
-    placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
-    shift = np.mean(placed.poses[inside, :2] - before, axis=0)
-    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), abs(float(pose[2]))))
+    placed, turn = truth.placed(drive.truth, drive.corrected)
+    if turn is None:
+        return drive
+    inside = drive.corrected.covers(placed.stamps_ns)
+    shift = np.mean((placed.poses - drive.truth.poses)[inside, :2], axis=0)
+    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), turn))
 
 
 def distances(path: Trajectory, stamps_ns: IntArray,
@@ -164,7 +160,7 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     assert truth is not None, 'only a truth tells errors'
     inside = truth.covers(path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
     true, poses = truth.at(path.stamps_ns[inside]), path.poses[inside]
-    if np.any(inside) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
+    if np.any(np.isfinite(true[:, 2])) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
         # a truth may begin just after the fixed node: the surest one that it covers is as good
         surest = int(np.argmin(np.trace(covariances[inside], axis1=1, axis2=2)))
         true = se2.compose(se2.compose(poses[surest], se2.inverse(true[surest])), true)
@@ -173,7 +169,7 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     found: dict[str, dict[str, Any] | None] = {}
     for name, size in (('position', 2), ('pose', 3)):
         blocks = covariances[inside][:, :size, :size]
-        valid = np.linalg.eigvalsh(blocks)[:, 0] > 0.0
+        valid = (np.linalg.eigvalsh(blocks)[:, 0] > 0.0) & np.isfinite(errors[:, size - 1])
         e, n = errors[valid, :size, None], int(np.sum(valid))
         nees = np.sum(e * np.linalg.solve(blocks[valid], e), axis=(1, 2))
         # quantiles of chi-square
@@ -205,15 +201,6 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
             'errors': [asdict(row) for row in drive.rows], **extra}
 
 
-def _path_of(samples: 'array[int]', poses: 'array[float]') -> Trajectory:
-    """Return samples as a path, the first one of equal stamps; of very many only some."""
-    stride = 1
-    while len(samples) // stride >= MOST_SAMPLES:
-        stride *= 2
-    stamps, first = np.unique(np.array(samples)[::stride], return_index=True)
-    return Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first])
-
-
 Measured = tuple[str, OdometrySample | Measurement, bool]
 """A measurement after its source, and whether it is kept out of the graph."""
 
@@ -235,23 +222,22 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
 
 
 def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
-             truth_topic: str | None, *, origin: geodesy.MapOrigin | None,
+             truth: Truth = UNKNOWN, *, origin: geodesy.MapOrigin | None,
              refused: Collection[Key] | None = None) -> Drive:
     """
     Return the path of an engine together with the measurements of the bag that it is made of.
 
-    Without the `origin` of its map, the first fix on the path makes it. Raises `BagError` if
-    `truth_topic` is missing or of an unsupported type. Else as `collect_drive`.
+    Without the `origin` of its map, the first fix on the path makes it. Raises `BagError` if the
+    topic of the truth is missing or of an unsupported type. Else as `collect_drive`.
     """
     reader = reader_of(bag, values)
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    return place_truth(replace(
-        collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-                      inputs.odometry[0], refused),
-        map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
-        truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
+    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+                          inputs.odometry[0], refused)
+    return place_truth(replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
+                               truth=truth.read(bag, inputs.span, reader.datum.plane)), truth)
 
 
 def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
@@ -309,29 +295,8 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     refused = {key for key in loops if key[0] in judged} if refused is None else refused
     return Drive(
-        _path_of(*odometry), corrected, None, stamps, positions,
+        path_of(*odometry), corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
         [source for source, _, _ in loops], arrived_ns=arrived)
-
-
-def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory:
-    """
-    Return the true poses that were recorded in a span; invalid messages are ignored.
-
-    Raises `BagError` if the topic is missing or of an unsupported type.
-    """
-    if (info := bag.topics.get(topic)) is None or info.type not in POSE_TYPES:
-        what = 'no topic' if info is None else f'type {info.type} of'
-        raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
-                       f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
-    samples, poses = array('q'), array('d')
-    for bag_message in bag.messages([topic], span):
-        with suppress(Exception):   # it may have other fields, by a definition in the bag
-            message = bag_message.decode()
-            pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
-            if not isinstance(pose, Answer):
-                samples.append(stamp_ns(message))
-                poses.extend(pose)
-    return _path_of(samples, poses)

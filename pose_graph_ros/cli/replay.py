@@ -26,9 +26,16 @@ from pose_graph_ros.adapters.conversions import Datum, frame
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, MessageReader, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, ON_EARTH
-from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
+from pose_graph_ros.cli.drive import (
+    collect_drive,
+    Drive,
+    drive_in,
+    measured_in,
+    place_truth,
+)
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
+from pose_graph_ros.cli.truth import truth_of
 from pose_graph_ros.core import alignment, exceptions
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
@@ -269,7 +276,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _execute_bags(options: argparse.Namespace) -> int:
     """Replay bags."""
-    values = shared.parameter_values(options)
+    values, truth = shared.parameter_values(options), truth_of(options)
     with ExitStack() as stack:
         bag = stack.enter_context(bags.open_bag(*options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out)
@@ -291,7 +298,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
         plane = reader.datum.plane
         done = _run_of(options, result, drive_in(
-            shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, options.truth,
+            shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, truth,
             origin=None if plane is None else plane.origin, refused=result.refused),
             values, inputs.kinds)
         facts: dict[str, Any] = {
@@ -308,13 +315,16 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
                        '--from and --until')
     require_datum(options.export, known=False)
-    values = shared.parameter_values(options, {'odom.noise': 'twist'})
+    values, truth = shared.parameter_values(options, {'odom.noise': 'twist'}), truth_of(options)
+    if truth.topic is not None:
+        raise BagError(f'--truth {truth.topic}: {options.bags[0]} has no topics; name a file')
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
                     for each in read_measurements(options.bags[0], options.edge2)]
     result = run(measurements, values)
     drive = collect_drive(
         ((*each, False) for each in measurements), result.backend, odometry, result.refused)
+    drive = place_truth(replace(drive, truth=truth.read(None)), truth)
     return _report(options, _run_of(options, result, drive, values, {
         odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}), {'seconds': result.seconds})
 

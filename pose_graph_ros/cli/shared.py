@@ -84,7 +84,8 @@ def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,
         raise bags.BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                             f'recording is {max(length, 0.0):.3f} s long')
     return bags.choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
-                              bags.Span(*limits), truth=options.truth)
+                              bags.Span(*limits), truth=options.truth if isinstance(
+                                  options.truth, str) else None)
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:

@@ -20,13 +20,14 @@ from pose_graph_ros.adapters.bags import BagError, choose_inputs, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import replay
-from pose_graph_ros.cli.drive import drive_in, read_truth, REFUSED
+from pose_graph_ros.cli.drive import drive_in, REFUSED
 from pose_graph_ros.cli.main import guarded, main
 from pose_graph_ros.cli.simulate import (
     loop_closure_messages,
     Message,
     odometry_messages,
 )
+from pose_graph_ros.cli.truth import read_truth
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -155,7 +156,7 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
         result = replayed_bag(bag, inputs, values)
-        drive = drive_in(bag, inputs, values, result.backend, None, origin=None,
+        drive = drive_in(bag, inputs, values, result.backend, origin=None,
                          refused=result.refused)
     assert result.backend.counts['loop_closure', 'before_window'] == 1
     assert drive.loop_states.tolist() == [REFUSED]
@@ -168,7 +169,7 @@ def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(datum, axes,
     values = checked({'datum': datum})
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
-        drive = drive_in(bag, inputs, values, replayed_bag(bag, inputs, values).backend, None,
+        drive = drive_in(bag, inputs, values, replayed_bag(bag, inputs, values).backend,
                          origin=None)
     assert drive.map_axes == axes
     assert drive.truth is None
