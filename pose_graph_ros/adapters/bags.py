@@ -33,6 +33,7 @@ from pose_graph_ros.adapters.conversions import StaticFrames
 from pose_graph_ros.adapters.damaged_bags import repair
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, MessageReader, Source
 from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.quantities import Seconds
 
 logger = logging.getLogger(__name__)
 
@@ -289,6 +290,7 @@ class Inputs:
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # kind by name of the source
     hold_out: int = 0  # every n-th fix, or global pose if there are none, is held out; 0: none
     span: Span = WHOLE  # when the messages that are read were recorded
+    stretch: Seconds | None = None  # every n-th stretch of the drive is held out, not every fix
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
@@ -394,7 +396,8 @@ def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[tuple[str, BagMessage, 
         for source in (name for name, topic in inputs.topics.items() if topic == message.topic):
             count += source in held
             yield source, message, (
-                source in held and inputs.hold_out > 0 and count % inputs.hold_out == 0)
+                source in held and inputs.stretch is None and inputs.hold_out > 0
+                and count % inputs.hold_out == 0)
 
 
 def read_static_frames(reader: Bag) -> list[BagMessage]:

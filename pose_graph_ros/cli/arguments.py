@@ -284,6 +284,8 @@ def _add_replayed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
     _add_inputs(parser)
+    parser.add_argument('--stretch', metavar='S', type=number(1.0, 3600.0), help='with '
+                        '--hold-out: every N-th stretch of S seconds in place of every N-th fix')
     _add_parameters(parser)
 
 

@@ -23,15 +23,24 @@ from pose_graph_ros.adapters import bags
 from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
 from pose_graph_ros.adapters.sources import MessageReader
 from pose_graph_ros.cli.truth import path_of, Truth, UNKNOWN
-from pose_graph_ros.core import measurements as kinds
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.measurements import (
+    Answer,
+    Fix,
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+    rejected,
+)
 from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.offline import noise
 
 STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
           State.DOUBTED.value, 'refused', 'held out')
@@ -208,6 +217,7 @@ Measured = tuple[str, OdometrySample | Measurement, bool]
 def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
                 *, held_out: bool) -> Iterator[Measured]:
     """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
+    start_ns: StampNs | None = None
     for source, message, is_held_out in bags.read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
@@ -217,8 +227,16 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
             measurement = rejected('malformed', '')
         if isinstance(measurement, Answer):
             refused[source, measurement.reason] += 1
-        else:
-            yield source, measurement, is_held_out
+            continue
+        if start_ns is None and isinstance(measurement, OdometrySample):
+            start_ns = measurement.stamp_ns
+        is_in_stretch = (
+            inputs.stretch is not None and start_ns is not None
+            and isinstance(measurement, Fix | GlobalPose | Position) and noise.is_in_part(
+                measurement.stamp_ns, start_ns, inputs.stretch, inputs.hold_out - 1,
+                inputs.hold_out))
+        if held_out or not is_in_stretch:
+            yield source, measurement, is_held_out or is_in_stretch
 
 
 def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
@@ -253,30 +271,30 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
     corrected = estimate.path
     loops, sources, held = list[Key](), list[str](), list[bool]()
     odometry = array('q'), array('d')
-    fixes = list[Fix | kinds.GlobalPose | kinds.Position]()
+    fixes = list[Fix | GlobalPose | Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         if not held_out:
             arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
-            case Fix() | kinds.GlobalPose() | kinds.Position():
+            case Fix() | GlobalPose() | Position():
                 fixes.append(measurement)
                 sources.append(source)
                 held.append(held_out)
-            case kinds.LoopClosure(stamp, _, _, int(reference)):
+            case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry[0].append(stamp)
                 odometry[1].extend(pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    arms = np.array([np.zeros(2) if isinstance(each, kinds.GlobalPose) else each.lever_arm
+    arms = np.array([np.zeros(2) if isinstance(each, GlobalPose) else each.lever_arm
                      for each in fixes]).reshape(-1, 2)
     inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
     # a fix that can have been used makes the datum, if there is none
     for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
         each = fixes[k]
         positions[k] = each.placed().position if isinstance(each, Fix) else (
-            each.pose[:2] if isinstance(each, kinds.GlobalPose) else each.position)
+            each.pose[:2] if isinstance(each, GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])

@@ -279,7 +279,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
     values, truth = shared.parameter_values(options), truth_of(options)
     with ExitStack() as stack:
         bag = stack.enter_context(bags.open_bag(*options.bags))
-        inputs = shared.inputs_of(bag, options, values, options.hold_out)
+        inputs = shared.inputs_of(bag, options, values, options.hold_out, options.stretch)
         require_datum(options.export, known=len(values['datum']) > 0 or len(inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
             BagWriter(options.new_bag, latched=LATCHED))

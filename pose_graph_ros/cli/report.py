@@ -35,7 +35,7 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')  # keys of run.json that --json prints
 OF_REPLAY = ('begin', 'until', 'edge2', 'params_file', 'truth', 'align', *bags.OPTIONS,
-             'param', 'hold_out')  # of bags alone
+             'param', 'hold_out', 'stretch')  # of bags alone
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
 

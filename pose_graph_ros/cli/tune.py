@@ -37,7 +37,6 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
@@ -124,10 +123,7 @@ class Tuning:
 
     def tune(self, folds: int, truth: TruthAt | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
-        if stretch is not None and stretch > self._duration / folds:
-            raise BagError(
-                f'{self._path}: expected stretches of at most {short(self._duration / folds)} s, '
-                f'as it lasts {short(self._duration)} s in {folds} parts, got {short(stretch)}')
+        shared.check_stretch(self._path, stretch, self._duration, folds)
         # what the settings before say is not looked for by the engine: it shows in other runs
         self._looking = {**self._values, **{
             f'{name}.correlation_time': -1.0 for name in self._sources
@@ -249,8 +245,8 @@ class Tuning:
         every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
                  if not isinstance(each, HeadingOnly)]
         every += [(name, each.stamp_ns) for name, each in self._closures]
-        left_out = {key for key in every if int(
-            (key[1] - self._start_ns) * 1e-9 / stretch) % folds == k}
+        left_out = {key for key in every
+                    if noise.is_in_part(key[1], self._start_ns, stretch, k, folds)}
         text = f'part {k + 1} of {folds} held out'
         before, runs = self._runs(text, left_out)
         values = checked({**self._values, **changed(self._estimate(runs, doubted)[0])})
