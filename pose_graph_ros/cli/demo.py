@@ -27,6 +27,7 @@ import time
 
 from pose_graph_ros.adapters.bags import BagError, choose_inputs, Inputs, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
+from pose_graph_ros.adapters.damaged_bags import ROS1_SUFFIXES
 from pose_graph_ros.adapters.sources import backend_config, source_list, Values
 from pose_graph_ros.cli import shared, simulate
 from pose_graph_ros.cli.drive import drive_in
@@ -64,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
     with open_bag(bag_path) as bag:
         inputs = choose_inputs(
             bag, source_list(values), wanted, options.hold_out, truth=truth.topic)
-    if bag_path.suffix == '.bag':
+    if bag_path.suffix in ROS1_SUFFIXES:
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')
     print(f'bag: {bag_path}')

@@ -37,7 +37,7 @@ SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error
 OF_REPLAY = ('begin', 'until', 'edge2', 'params_file', 'truth', 'align', *bags.OPTIONS,
              'param', 'hold_out', 'stretch')  # of bags alone
 PAGES = ('.html', '.htm')
-BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
+BAG_SUFFIXES = (*bags.BAG_FILE_SUFFIXES, '.g2o', '.graph')
 
 
 def execute(options: argparse.Namespace) -> int:

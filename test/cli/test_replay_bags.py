@@ -93,7 +93,7 @@ def test_wrong_bags_are_one_line_that_names_them(tmp_path, capsys) -> None:
     good = tmp_path / 'good'
     write_bag(good, drive())
     whole = write_ros1(tmp_path / 'whole.bag', drive()).read_bytes()
-    for name, data in (('cut.bag', whole[:len(whole) // 2]), ('text.bag', b'something else')):
+    for name, data in (('cut.bag', whole[:4000]), ('text.bag', b'something else')):
         (tmp_path / name).write_bytes(data)
         text = error_of(capsys, good, tmp_path / name)
         assert text.startswith(f'error: {tmp_path / name}: damaged, cut short or not supported')
