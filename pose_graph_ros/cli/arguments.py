@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 from pose_graph_ros.core.judgement.settings import BELIEF
 
 ON_EARTH = ('geojson', 'kml', 'gpx')  # whose positions are latitudes and longitudes
-FORMATS = ('kitti', 'csv', *ON_EARTH)  # of a path, also the endings of files
+FULL = 'tum_full'   # of a path with the poses between its hidden nodes
+FORMATS = ('kitti', 'csv', FULL, *ON_EARTH)  # of a path, also the endings of files
 EDGE2_ORDERS = ('toro', 'isam')
 STARTS = ('chordal', 'file', 'odometry', 'best')
 METHODS = ('selection', 'gnc', 'gnc-gm')  # to decide which closures to believe
