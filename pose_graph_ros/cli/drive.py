@@ -21,8 +21,8 @@ from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters import bags
 from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
-from pose_graph_ros.adapters.sources import MessageReader
-from pose_graph_ros.cli.truth import path_of, Truth, UNKNOWN
+from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY
+from pose_graph_ros.cli.truth import Heighted, path_of, Truth, UNKNOWN
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
@@ -78,6 +78,8 @@ class Drive:
     map_axes: tuple[str, str] = ('x', 'y')
     arrived_ns: 'Mapping[str, Sequence[StampNs]]' = field(default_factory=dict)
     """Stamps of what was measured and not held out, in the order of arrival, by source."""
+    odometry_heights: FloatArray = field(default_factory=lambda: np.zeros(0))   # [m]
+    truth_heights: FloatArray = field(default_factory=lambda: np.zeros(0))  # NaN: unknown [m]
     truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
 
     @property
@@ -134,6 +136,12 @@ def place_truth(drive: Drive, truth: Truth = UNKNOWN) -> Drive:
     return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), turn))
 
 
+def with_truth(drive: Drive, truth: Truth, known: Heighted | None) -> Drive:
+    """Return a drive with the true poses, if they are known, where they are compared."""
+    return drive if known is None else place_truth(
+        replace(drive, truth=known[0], truth_heights=known[1]), truth)
+
+
 def distances(path: Trajectory, stamps_ns: IntArray,
               positions: Points) -> tuple[IntArray, FloatArray]:
     """Return the stamps that a path covers, and its distances from positions at these [m]."""
@@ -147,6 +155,25 @@ def extent(path: Trajectory) -> tuple[float, float]:
     stamps, steps = path.stamps_ns, np.diff(path.poses[:, :2], axis=0)
     return (float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 0 else 0.0,
             float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+
+def lengths(drive: Drive) -> dict[str, float | None]:
+    """
+    Return the lengths of path, odometry and truth during the path [m], for JSON.
+
+    They are those in the plane, and with the heights of the poses where these are known.
+    """
+    found: dict[str, float | None] = {'path': extent(drive.corrected)[1]}
+    for name, path, heights in (('odometry', drive.odometry, drive.odometry_heights),
+                                ('truth', drive.truth, drive.truth_heights)):
+        found |= {name: None, f'{name}_with_heights': None}
+        if path is not None and np.any(inside := drive.corrected.covers(path.stamps_ns)):
+            flat = np.hypot(*np.diff(path.poses[inside, :2], axis=0).T)
+            up = np.diff(heights[inside]) if len(heights) == len(path) else np.zeros(0)
+            found[name] = float(np.sum(flat))
+            if np.any(up) and np.all(np.isfinite(up)):
+                found[f'{name}_with_heights'] = float(np.sum(np.hypot(flat, up)))
+    return found
 
 
 def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
@@ -204,7 +231,8 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
     duration, distance = extent(drive.corrected)
     return {'duration_s': duration, 'distance_m': distance, 'odometry': len(drive.odometry),
-            'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
+            'lengths_m': lengths(drive), 'poses': len(drive.corrected), **{
+                f'fixes_{kind.replace(" ", "_")}': int(
                 np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
             'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
             'errors': [asdict(row) for row in drive.rows], **extra}
@@ -215,21 +243,29 @@ Measured = tuple[str, OdometrySample | Measurement, bool]
 
 
 def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
-                *, held_out: bool) -> Iterator[Measured]:
-    """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
+                *, held_out: bool, heights: 'array[float] | None' = None) -> Iterator[Measured]:
+    """
+    Yield the valid measurements of a bag, with those that are held out if they are wanted.
+
+    The height of each pose of the first odometry is added to the heights, NaN if it has no pose.
+    """
     start_ns: StampNs | None = None
     for source, message, is_held_out in bags.read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
         try:
-            measurement = reader.read(source, message.decode())
+            content = message.decode()
+            measurement = reader.read(source, content)
         except MessageError:
             measurement = rejected('malformed', '')
         if isinstance(measurement, Answer):
             refused[source, measurement.reason] += 1
             continue
-        if start_ns is None and isinstance(measurement, OdometrySample):
-            start_ns = measurement.stamp_ns
+        if isinstance(measurement, OdometrySample):
+            start_ns = measurement.stamp_ns if start_ns is None else start_ns
+            if heights is not None and source == inputs.odometry[0]:
+                heights.append(content.pose.pose.position.z
+                               if inputs.kinds[source] is ODOMETRY else np.nan)
         is_in_stretch = (
             inputs.stretch is not None and start_ns is not None
             and isinstance(measurement, Fix | GlobalPose | Position) and noise.is_in_part(
@@ -252,19 +288,23 @@ def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseG
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-                          inputs.odometry[0], refused)
-    return place_truth(replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
-                               truth=truth.read(bag, inputs.span, reader.datum.plane)), truth)
+    heights = array('d')
+    drive = collect_drive(
+        measured_in(bag, inputs, reader, Counter(), held_out=True, heights=heights), backend,
+        inputs.odometry[0], refused, heights)
+    return with_truth(replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y')),
+                      truth, truth.read(bag, inputs.span, reader.datum.plane))
 
 
 def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
-                  odometry_source: str, refused: Collection[Key] | None) -> Drive:
+                  odometry_source: str, refused: Collection[Key] | None,
+                  heights: 'array[float] | None' = None) -> Drive:
     """
     Return the path of an engine together with the measurements that it is made of.
 
     Loop closures without a verdict are believed but for those that were `refused`; None if it is
-    not known which: then all of sources that are judged.
+    not known which: then all of sources that are judged. The heights of odometry may come in as
+    its samples are asked for.
     """
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
@@ -312,9 +352,10 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
         # of several with one stamp the first one was added
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     refused = {key for key in loops if key[0] in judged} if refused is None else refused
+    path, known_heights = path_of(*odometry, heights or array('d'))
     return Drive(
-        path_of(*odometry), corrected, None, stamps, positions,
+        path, corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
-        [source for source, _, _ in loops], arrived_ns=arrived)
+        [source for source, _, _ in loops], arrived_ns=arrived, odometry_heights=known_heights)

@@ -31,7 +31,7 @@ from pose_graph_ros.cli.drive import (
     Drive,
     drive_in,
     measured_in,
-    place_truth,
+    with_truth,
 )
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
@@ -335,7 +335,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     result = run(measurements, values)
     drive = collect_drive(
         ((*each, False) for each in measurements), result.backend, odometry, result.refused)
-    drive = place_truth(replace(drive, truth=truth.read(None)), truth)
+    drive = with_truth(drive, truth, truth.read(None))
     samples = [(each.stamp_ns, _pose(each)) for _, each in measurements
                if isinstance(each, OdometrySample)]
     path, is_full = drive.corrected, FULL in options.export.formats

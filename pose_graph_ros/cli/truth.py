@@ -22,6 +22,7 @@ from pose_graph_ros.adapters.sources import GLOBAL_POSE, ODOMETRY
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.io.path_files import PathFile, read_path, seconds_text
 from pose_graph_ros.core.measurements import Answer
@@ -30,6 +31,10 @@ from pose_graph_ros.core.quantities import Radians
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
+
+
+Heighted = tuple[Trajectory, FloatArray]
+"""A path and the heights of its poses [m], NaN or none where they are unknown."""
 
 
 class Truth(NamedTuple):
@@ -41,16 +46,17 @@ class Truth(NamedTuple):
     is_aligned: bool = True
 
     def read(self, bag: Bag | None, span: bags.Span = bags.WHOLE,
-             plane: TangentPlane | None = None) -> Trajectory | None:
-        """Return the true poses, in the map of a plane if they are on the Earth, if known."""
+             plane: TangentPlane | None = None) -> Heighted | None:
+        """Return the true poses, if known, in the map of a plane if they are on the Earth."""
         if self.content is None:
             return None if self.topic is None or bag is None else read_truth(bag, self.topic, span)
         stamps, places, headings, is_on_earth = self.content
+        heights = places[:, 2]
         if is_on_earth:
             plane = plane or TangentPlane(*places[0, :2])
-            heights = np.where(np.isfinite(places[:, 2]), places[:, 2], plane.altitude)
-            places = plane.to_map(places[:, 0], places[:, 1], heights)
-        return Trajectory(stamps, np.column_stack((places[:, :2], headings)))
+            places = plane.to_map(places[:, 0], places[:, 1], np.where(
+                np.isfinite(heights), heights, plane.altitude))
+        return Trajectory(stamps, np.column_stack((places[:, :2], headings))), heights
 
     def placed(self, truth: Trajectory,
                path: Trajectory) -> tuple[Trajectory, Radians | None]:
@@ -80,7 +86,7 @@ def truth_of(options: argparse.Namespace) -> Truth:
         given, is_aligned=is_aligned)
 
 
-def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory:
+def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Heighted:
     """
     Return the true poses that were recorded in a span; invalid messages are ignored.
 
@@ -90,21 +96,23 @@ def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
-    samples, poses = array('q'), array('d')
+    samples, poses, heights = array('q'), array('d'), array('d')
     for bag_message in bag.messages([topic], span):
         with suppress(Exception):   # it may have other fields, by a definition in the bag
             message = bag_message.decode()
-            pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
-            if not isinstance(pose, Answer):
+            given = message.pose if info.type == POSE else message.pose.pose
+            if not isinstance(pose := planar_pose(given), Answer):
+                heights.append(given.position.z)
                 samples.append(stamp_ns(message))
                 poses.extend(pose)
-    return path_of(samples, poses)
+    return path_of(samples, poses, heights)
 
 
-def path_of(samples: 'array[int]', poses: 'array[float]') -> Trajectory:
+def path_of(samples: 'array[int]', poses: 'array[float]', heights: 'array[float]') -> Heighted:
     """Return samples as a path, the first one of equal stamps; of very many only some."""
     stride = 1
     while len(samples) // stride >= MOST_SAMPLES:
         stride *= 2
     stamps, first = np.unique(np.array(samples)[::stride], return_index=True)
-    return Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first])
+    return (Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first]),
+            np.array(heights)[::stride][first] if len(heights) > 0 else np.zeros(0))

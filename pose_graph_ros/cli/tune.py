@@ -322,12 +322,12 @@ def execute(options: argparse.Namespace) -> int:
     with open_bag(*options.bags) as bag:
         inputs = shared.inputs_of(bag, options, values)
         tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values)
-        true = truth.read(bag, inputs.span, tuning.datum.plane)
-    if true is not None:
-        truth.placed(true, tuning.span)     # so that wrong times are said at once
+        known = truth.read(bag, inputs.span, tuning.datum.plane)
+    if known is not None:
+        truth.placed(known[0], tuning.span)     # so that wrong times are said at once
     try:
-        outcome = tuning.tune(options.folds, None if true is None else lambda path: truth.placed(
-            true, path)[0], options.stretch)
+        outcome = tuning.tune(options.folds, None if known is None else lambda path: truth.placed(
+            known[0], path)[0], options.stretch)
     finally:
         _show('')
     names = ' '.join(each.name for each in options.bags)
