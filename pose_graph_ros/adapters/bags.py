@@ -5,7 +5,7 @@ Read bags without a ROS installation.
 
 A bag is a rosbag2 folder, one of its .mcap or .db3 files, or a ROS 1 .bag file. A bag that cannot
 be read raises `BagError`, whose message begins with the path. The caller decodes each message, so
-that one that cannot be decoded (`MessageError`) does not end the iteration. A rosbag2 that was cut
+that one that cannot be decoded (`MessageError`) does not end the iteration. A bag that was cut
 short or damaged is read as far as it goes, with a warning (`damaged_bags`). Player and replay
 choose the topics that feed the sources alike.
 """
@@ -30,13 +30,14 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from pose_graph_ros.adapters.conversions import StaticFrames
-from pose_graph_ros.adapters.damaged_bags import repair
+from pose_graph_ros.adapters.damaged_bags import repair, ROS1_SUFFIXES
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, MessageReader, Source
 from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.quantities import Seconds
 
 logger = logging.getLogger(__name__)
 
-BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
+BAG_FILE_SUFFIXES = ('.mcap', '.db3', *ROS1_SUFFIXES)
 JOURNALS = ('.db3-wal', '.db3-journal')
 
 
@@ -173,8 +174,7 @@ class Bag:
         except Exception as error:  # the parsers can raise anything on a damaged file
             text = f'damaged after {seen.total()} messages: {one_line(error)}'
             with ExitStack() as stack:
-                rest = None if path.suffix == '.bag' else _repaired(path, text, stack)
-                if rest is None:
+                if (rest := _repaired(path, text, stack)) is None:
                     raise BagError(f'{path}: {text}') from error
                 yield from self._read(path, rest, topics, span if last_ns is None else Span(
                     last_ns + 1, span.end_ns))
@@ -188,7 +188,7 @@ class Bag:
 
 def open_bag(*paths: str | Path) -> Bag:
     """
-    Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
+    Open a rosbag2 folder (sqlite3 or mcap, also compressed), or one of `BAG_FILE_SUFFIXES`.
 
     Several follow each other, in any order. Raises `BagError` for a path that is no bag, or a bag
     that is damaged or not supported.
@@ -215,28 +215,28 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
             rest := _repaired(path, 'the recording was not ended, it has a journal', stack)):
         return rest
     try:
-        return _opened(Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path),
-                       stack)
+        return _opened(path, path, stack)
     except Exception as error:  # the parsers can raise anything on a damaged file
-        if path.suffix != '.bag' and (
-                rest := _repaired(path, f'damaged or cut short: {one_line(error)}', stack)):
+        if (rest := _repaired(path, f'damaged or cut short: {one_line(error)}', stack)):
             return rest
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
 
 
-def _opened(reader: Reader, stack: ExitStack) -> Reader:
+def _opened(path: Path, copy: Path, stack: ExitStack) -> Reader:
+    """Return an open reader of a copy of what is at a path."""
+    reader = (Rosbag1Reader if path.suffix in ROS1_SUFFIXES else Rosbag2Reader)(copy)
     reader.open()
     stack.callback(reader.close)
     return reader
 
 
 def _repaired(path: Path, reason: str, stack: ExitStack) -> Reader | None:
-    """Return a reader of a copy of what can be read of a rosbag2; None if nothing can."""
+    """Return a reader of a copy of what can be read of a bag; None if nothing can."""
     folder = stack.enter_context(TemporaryDirectory(prefix='pose_graph_'))
     copy = Path(folder, 'bag')
     try:
-        return _opened(Rosbag2Reader(copy), stack) if repair(path, reason, copy) else None
+        return _opened(path, copy, stack) if repair(path, reason, copy) else None
     except OSError as error:
         raise BagError(f'{path}: {reason}; what can be read of it cannot be copied to '
                        f'{folder}: {one_line(error)}') from error
@@ -289,6 +289,7 @@ class Inputs:
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # kind by name of the source
     hold_out: int = 0  # every n-th fix, or global pose if there are none, is held out; 0: none
     span: Span = WHOLE  # when the messages that are read were recorded
+    stretch: Seconds | None = None  # every n-th stretch of the drive is held out, not every fix
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
@@ -394,7 +395,8 @@ def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[tuple[str, BagMessage, 
         for source in (name for name, topic in inputs.topics.items() if topic == message.topic):
             count += source in held
             yield source, message, (
-                source in held and inputs.hold_out > 0 and count % inputs.hold_out == 0)
+                source in held and inputs.stretch is None and inputs.hold_out > 0
+                and count % inputs.hold_out == 0)
 
 
 def read_static_frames(reader: Bag) -> list[BagMessage]:

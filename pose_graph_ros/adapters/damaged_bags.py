@@ -1,14 +1,16 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Copy what can still be read of damaged .mcap or .db3 files, as after the recorder was killed.
+Copy what can still be read of damaged bags, as after the recorder was killed.
 
-An mcap file is walked through from its start, as its index is at the end; where a record makes no
-sense, the next one that does is looked for. The rows of an sqlite3 file are read in their order;
-those on damaged pages are left out. The copy is a whole bag, which is read like any other.
+An mcap file and a bag of ROS 1 are walked through from their start, as the index is at the end;
+where a record makes no sense, the next one that does is looked for. The rows of an sqlite3 file
+are read in their order; those on damaged pages are left out. The copy is a whole bag, which is
+read like any other.
 """
 
-from collections.abc import Callable, Iterator
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from io import BytesIO
 import logging
@@ -23,11 +25,16 @@ from typing import Any
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import metadata, storage_mcap, StoragePlugin, Writer
+from rosbags.typesys.msg import normalize_msgtype
 import yaml
 
 logger = logging.getLogger(__name__)
+zstd = storage_mcap.zstd
 
+ROS1_SUFFIXES = '.bag', '.active'     # `record` adds the second one until it has ended
+LONGEST_CHUNK = 2**30   # as much is made of one at most [bytes]
 NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 # Kinds of records of an mcap file, and what they begin with.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = range(2, 7)
@@ -36,9 +43,18 @@ _CHUNK_HEAD = struct.Struct('<QQQII')   # first and last stamp, size, checksum, 
 _MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, number, when recorded, when published
 # Kind and length of a record that may have content: no message has 16 MB, and no chunk 4 GB.
 _RECORD = re.compile(rb'[\x03-\x05].{3}\0{5}|\x06.{4}\0{4}', re.DOTALL)
-_DECOMPRESSORS = {'zstd': storage_mcap.zstd.ZstdDecompressor, 'lz4': LZ4FrameDecompressor}
+# Kinds of records of a bag of ROS 1, and the header of a chunk, whose fields have any order.
+_ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CHUNK_INFO, _ROS1_CONNECTION = 2, 5, 6, 7
+_ROS1_CHUNK_HEAD = re.compile(
+    rb'[\x28\x29]\0{3}(?:\x04\0{3}op=\x05|[\x0f\x10]\0{3}compression=|\x09\0{3}size=)')
+_DECOMPRESSORS = {'zstd': zstd.ZstdDecompressor, 'lz4': LZ4FrameDecompressor,
+                  'bz2': BZ2Decompressor}
+_ZSTD = b'\x28\xb5\x2f\xfd'    # begin of a message that was compressed; CDR begins otherwise
 Connect = Callable[..., Connection]
-"""Return the connection of the copy, by its topic, type, encoding, definition and quality."""
+"""Return the connection of the copy, by its topic, type, form, definition and quality of service.
+
+The form is the encoding, of ROS 1 the MD5 sum of the type; and the quality whether it is latched.
+"""
 _Message = tuple[Connection, int, bytes]    # and when it was recorded [ns]
 
 
@@ -130,14 +146,15 @@ class _Sqlite:
         for end in ('', '-wal', '-journal'):
             with suppress(FileNotFoundError):
                 shutil.copyfile(path.with_name(path.name + end), copy.with_name(copy.name + end))
-        # make a file that was cut short as long as its head says, else SQLite does not open it
+        # let the head say how many pages are left, else SQLite does not open what was cut short
         with copy.open('r+b') as file:
-            head = file.read(32)
+            head, size = file.read(32), copy.stat().st_size
             page = int.from_bytes(head[16:18], 'big')
-            length = int.from_bytes(head[28:32], 'big') * (65536 if page == 1 else page)
-            size = copy.stat().st_size
-            if size < length <= 1000 * max(size, 1):    # else the head is wrong
-                file.truncate(length)   # the rest takes no room on the disk
+            pages = size // (65536 if page == 1 else max(page, 512))
+            if pages < int.from_bytes(head[28:32], 'big'):
+                self.n_damaged += 1
+                file.seek(28)
+                file.write(pages.to_bytes(4, 'big'))
         self._database = sqlite3.connect(copy)
         self._database.text_factory = lambda text: text.decode(errors='replace')
 
@@ -181,9 +198,137 @@ class _Sqlite:
         self.complete = self.n_damaged == 0
 
 
+class _Ros1:
+    """A bag of ROS 1, cut short or with damaged bytes."""
+
+    def __init__(self, path: Path, connect: Connect) -> None:
+        self.complete, self.n_damaged, self._connect = False, 0, connect
+        self._topics: dict[int, Connection] = {}
+        with path.open('rb') as file:
+            self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self.close = self._file.close
+
+    def messages(self) -> Iterator[_Message]:
+        """Yield all messages."""
+        return self._messages(self._file, len(b'#ROSBAG V2.0\n'))
+
+    def _messages(self, data: bytes | mmap.mmap, at: int) -> Iterator[_Message]:
+        """Yield the messages of the records that make sense."""
+        while at < len(data):
+            begin = at + 8 + _number(data[at:at + 4])
+            end = begin + _number(data[begin - 4:begin])
+            fields = _fields(data[at + 4:begin - 4])
+            kind = _number(fields.get(b'op', b''))
+            if kind not in range(2, 8) or begin > len(data) or (
+                    end > len(data) and kind != _ROS1_CHUNK):
+                self.n_damaged += 1
+                if (following := _ROS1_CHUNK_HEAD.search(data, at + 1)) is None:
+                    return
+                at = following.start()
+                continue
+            if kind == _ROS1_CHUNK:
+                form = fields.get(b'compression', b'').decode(errors='replace')
+                if end == begin and form != 'none':     # it was being written
+                    end = len(data)
+                yield from self._in_chunk(form, data[begin:end])
+            elif kind == _ROS1_CONNECTION:
+                self._define({**fields, **_fields(data[begin:end])})
+            elif kind == _ROS1_MESSAGE:
+                topic = self._topics.get(_number(fields.get(b'conn', b'')))
+                time = fields.get(b'time', b'')
+                if topic is not None and len(time) == 8:
+                    yield (topic, _number(time[:4]) * 10**9 + _number(time[4:]),
+                           bytes(data[begin:end]))
+            self.complete |= kind == _ROS1_CHUNK_INFO
+            at = end
+
+    def _in_chunk(self, form: str, data: bytes) -> Iterator[_Message]:
+        """Yield the messages of a chunk; none if its content cannot be decompressed."""
+        try:
+            content = data if form == 'none' else bytes(
+                _DECOMPRESSORS[form]().decompress(data, LONGEST_CHUNK))
+        except Exception:   # decompression can raise anything
+            self.n_damaged += 1
+            return
+        yield from self._messages(content, 0)
+
+    def _define(self, fields: Mapping[bytes, bytes]) -> None:
+        """Note what a record of a connection says, unless another one said it."""
+        number = _number(fields.get(b'conn', b''))
+        with suppress(KeyError, UnicodeDecodeError):
+            if number not in self._topics:
+                self._topics[number] = self._connect(*(fields[name].decode() for name in (
+                    b'topic', b'type', b'md5sum', b'message_definition')),
+                    fields.get(b'latching') == b'1')
+
+
+def _number(data: bytes) -> int:
+    return int.from_bytes(data, 'little')
+
+
+def _fields(head: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a header of ROS 1 by name; none if it makes no sense."""
+    fields, at = dict[bytes, bytes](), 0
+    while at < len(head):
+        end = at + 4 + _number(head[at:at + 4])
+        name, _, value = head[at + 4:end].partition(b'=')
+        fields[name], at = value, end
+    return fields if at == len(head) else {}
+
+
+def _unpack(path: Path, copy: Path) -> Path:
+    """Return a copy of a file that rosbag2 has compressed, as far as it goes."""
+    unpacked = zstd.ZstdDecompressor()
+    with path.open('rb') as source, copy.open('wb') as target, suppress(zstd.ZstdError):
+        while not unpacked.eof and (part := source.read(2**20)):
+            target.write(unpacked.decompress(part))
+    return copy
+
+
+def _connector(writer: Writer | Rosbag1Writer) -> Connect:
+    """Return what adds each connection once."""
+    connections: dict[tuple[object, ...], Connection] = {}
+
+    def connect(topic: str, of_type: str, form: str, definition: str,
+                qualities: Any) -> Connection:
+        if (key := (topic, of_type, form)) not in connections:
+            connections[key] = writer.add_connection(
+                topic, normalize_msgtype(of_type), md5sum=form, msgdef=definition,
+                latching=int(qualities)) if isinstance(writer, Rosbag1Writer) else (
+                    writer.add_connection(
+                        topic, of_type, msgdef=definition, rihs01=NO_HASH,
+                        serialization_format=form, offered_qos_profiles=qualities))
+        return connections[key]
+    return connect
+
+
+def _messages_in(file: Path, connect: Connect,
+                 found: list[_Mcap | _Sqlite | _Ros1]) -> Iterator[_Message]:
+    """Yield the messages of a file, also if rosbag2 has compressed it or each of them."""
+    with TemporaryDirectory() as folder, suppress(sqlite3.Error, ValueError):
+        name = file.name.removesuffix('.zstd')
+        if name != file.name:
+            file = _unpack(file, Path(folder, name))
+        kind = _Ros1 if file.suffix in ROS1_SUFFIXES else (
+            _Sqlite if file.suffix == '.db3' else _Mcap)
+        with closing(kind(file, connect)) as damaged:
+            found.append(damaged)
+            for connection, recorded_ns, data in damaged.messages():
+                if not 0 <= recorded_ns < 2**63:
+                    continue
+                if kind is not _Ros1 and data.startswith(_ZSTD):
+                    try:
+                        yield connection, recorded_ns, zstd.ZstdDecompressor().decompress(
+                            data, LONGEST_CHUNK)
+                    except zstd.ZstdError:
+                        damaged.n_damaged += 1
+                else:
+                    yield connection, recorded_ns, data
+
+
 def repair(path: Path, reason: str, copy: Path) -> bool:
     """
-    Write what can be read of an .mcap or .db3 file or a folder of them as a bag, if anything can.
+    Write what can be read of a file or a folder of .mcap or .db3 files as a bag, if anything can.
 
     A warning says how much time is missing, as far as the metadata beside the files tell.
     """
@@ -191,32 +336,21 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     with suppress(OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
         text = ((path if path.is_dir() else path.parent) / 'metadata.yaml').read_text('utf-8')
         about = dict(yaml.safe_load(text)['rosbag2_bagfile_information'])
-    if about.get('compression_format'):
-        return False    # what rosbag2 itself has compressed is not unpacked here
+    if about.get('compression_format') not in {None, '', 'zstd'}:
+        return False    # rosbag2 has none but zstd, and its messages cannot be unpacked here
     listed = [Path(str(name)).name for name in about.get('relative_file_paths') or ()]
-    files = [path] if path.is_file() else [
+    files = [path] if path.is_file() else [each for each in [
         path / name for name in listed if (path / name).is_file()] or sorted(path.iterdir())
-    files = [each for each in files if each.suffix in {'.mcap', '.db3'}]
-    found: list[_Mcap | _Sqlite] = []
-    connections: dict[tuple[str, str], Connection] = {}
-
-    def connect(topic: str, of_type: str, encoding: str, definition: str,
-                qualities: list[Qos]) -> Connection:
-        if (topic, of_type) not in connections:
-            connections[topic, of_type] = writer.add_connection(
-                topic, of_type, msgdef=definition, rihs01=NO_HASH, serialization_format=encoding,
-                offered_qos_profiles=qualities)
-        return connections[topic, of_type]
-
-    with Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        if each.name.removesuffix('.zstd').endswith(('.mcap', '.db3'))]
+    n, begin_ns, end_ns = 0, 2**63, 0
+    found: list[_Mcap | _Sqlite | _Ros1] = []
+    with (Rosbag1Writer(copy) if path.suffix in ROS1_SUFFIXES else
+          Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP)) as writer:
+        connect = _connector(writer)
         for file in files:
-            with suppress(sqlite3.Error, ValueError), closing(
-                    (_Sqlite if file.suffix == '.db3' else _Mcap)(file, connect)) as damaged:
-                found.append(damaged)
-                for connection, recorded_ns, data in damaged.messages():
-                    if 0 <= recorded_ns < 2**63:
-                        writer.write(connection, recorded_ns, data)
-    n, end_ns = sum(writer.counts.values()), writer.max_timestamp + 1
+            for connection, recorded_ns, data in _messages_in(file, connect, found):
+                writer.write(connection, recorded_ns, data)
+                n, begin_ns, end_ns = n + 1, min(begin_ns, recorded_ns), max(end_ns, recorded_ns)
     if n == 0:
         return False
     missing = 'how much is missing is not known'
@@ -224,11 +358,10 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
         with suppress(KeyError, TypeError, ValueError):
             wanted_ns = (int(about['starting_time']['nanoseconds_since_epoch'])
                          + int(about['duration']['nanoseconds']))
-            missing = f'{max(1e-9 * (wanted_ns + 1 - end_ns), 0.0):.1f} s at the end are missing'
+            missing = f'{max(1e-9 * (wanted_ns - end_ns), 0.0):.1f} s at the end are missing'
     if len(found) == len(files) and all(each.complete for each in found):
         missing = 'its end is there'
     logger.warning('%s: %s; what can be read of it is used: '
                    '%d messages in %.1f s, %d damaged parts are left out, %s', path, reason, n,
-                   1e-9 * (end_ns - writer.min_timestamp), sum(each.n_damaged for each in found),
-                   missing)
+                   1e-9 * (end_ns + 1 - begin_ns), sum(each.n_damaged for each in found), missing)
     return True

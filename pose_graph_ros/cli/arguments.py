@@ -17,13 +17,15 @@ from typing import Any, NamedTuple
 from pose_graph_ros.core.judgement.settings import BELIEF
 
 ON_EARTH = ('geojson', 'kml', 'gpx')  # whose positions are latitudes and longitudes
-FORMATS = ('kitti', 'csv', *ON_EARTH)  # of a path, also the endings of files
+FULL = 'tum_full'   # of a path with the poses between its hidden nodes
+FORMATS = ('kitti', 'csv', FULL, *ON_EARTH)  # of a path, also the endings of files
 EDGE2_ORDERS = ('toro', 'isam')
 STARTS = ('chordal', 'file', 'odometry', 'best')
 METHODS = ('selection', 'gnc', 'gnc-gm')  # to decide which closures to believe
 VIEWS = ('pose-graph', 'factor-graph', 'mrf', 'dbn')
 PICTURES = ('.svg', '.png')
 LANDMARKS = 'landmarks'
+TRUTH_SUFFIXES = ('.tum', '.txt', '.csv')  # of files; no topic has a dot in its name
 
 
 class Exports(NamedTuple):
@@ -308,6 +310,8 @@ def _add_replayed(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
     _add_inputs(parser)
+    parser.add_argument('--stretch', metavar='S', type=number(1.0, 3600.0), help='with '
+                        '--hold-out: every N-th stretch of S seconds in place of every N-th fix')
     _add_parameters(parser)
 
 
@@ -332,11 +336,12 @@ def _add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> No
                       'imu'),
             ('--gyro', 'sensor_msgs/Imu with an angular velocity, if the parameter sources lists '
                        'gyro'),
-            ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
-                        'for comparison')):
-        # with the slash that recorders of ROS 1 may leave out
-        group.add_argument(option, metavar='TOPIC', help=text,
-                           type=lambda topic: '/' + topic.removeprefix('/'))
+            ('--truth', 'only used for comparison: Odometry, PoseStamped or PoseWithCovariance'
+                        f'Stamped; or a file, {", ".join(TRUTH_SUFFIXES)} (TUM or a table)')):
+        group.add_argument(option, metavar='TOPIC', help=text, type=_topic_or_file if (
+            option == '--truth') else _topic)
+    parser.add_argument('--align', action=argparse.BooleanOptionalAction, default=None,
+                        help='compare the truth where it fits the path best (default: yes)')
     if hold_out:
         parser.add_argument('--hold-out', metavar='N', type=int, default=0,
                             help='keep every N-th fix out of the graph and use it for comparison')
@@ -348,6 +353,15 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
                         help='ROS 2 parameter file of the node')
     parser.add_argument('-p', '--param', metavar='NAME:=VALUE', action='append', default=[],
                         help='parameter of the node, as after --ros-args; may be repeated')
+
+
+def _topic(name: str) -> str:
+    """Return a topic with the slash that recorders of ROS 1 may leave out."""
+    return '/' + name.removeprefix('/')
+
+
+def _topic_or_file(name: str) -> str | Path:
+    return Path(name) if name.endswith(TRUTH_SUFFIXES) else _topic(name)
 
 
 def number(least: float = -math.inf, most: float = math.inf, *, whole: bool = False,

@@ -27,10 +27,12 @@ import time
 
 from pose_graph_ros.adapters.bags import BagError, choose_inputs, Inputs, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
+from pose_graph_ros.adapters.damaged_bags import ROS1_SUFFIXES
 from pose_graph_ros.adapters.sources import backend_config, source_list, Values
 from pose_graph_ros.cli import shared, simulate
 from pose_graph_ros.cli.drive import drive_in
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
+from pose_graph_ros.cli.truth import truth_of
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -49,18 +51,21 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     values = shared.parameter_values(options)
     options.out.mkdir(parents=True, exist_ok=True)
-    bag_path, truth, wanted = options.bag, options.truth, shared.wanted_topics(options)
+    bag_path, wanted = options.bag, shared.wanted_topics(options)
     title = 'Simulated drive' if bag_path is None else bag_path.stem
     if bag_path is None:
-        bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
+        bag_path = options.out / 'simulated_drive'
+        options.truth = options.truth or '/ground_truth'
         print('simulating a drive')
         way = recording.course(worlds.WORLDS['drive'], 1, settings.DURATIONS_S['drive'])
         simulate.write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}
+    truth = truth_of(options)
     with open_bag(bag_path) as bag:
-        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out, truth=truth)
-    if bag_path.suffix == '.bag':
+        inputs = choose_inputs(
+            bag, source_list(values), wanted, options.hold_out, truth=truth.topic)
+    if bag_path.suffix in ROS1_SUFFIXES:
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')
     print(f'bag: {bag_path}')

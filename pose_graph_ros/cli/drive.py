@@ -12,7 +12,6 @@ its map may begin elsewhere, as where only a part of a recording is replayed.
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,22 +20,28 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.bags import Bag, BagError, Inputs, MessageError, reader_of
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
-from pose_graph_ros.core import measurements as kinds
+from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
+from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY
+from pose_graph_ros.cli.truth import Heighted, path_of, Truth, UNKNOWN
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.measurements import (
+    Answer,
+    Fix,
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+    rejected,
+)
 from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.offline import noise
 
-MOST_SAMPLES = 200_000  # of a path that are compared and drawn
-POSE = 'geometry_msgs/msg/PoseStamped'
-POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
           State.DOUBTED.value, 'refused', 'held out')
 BELIEVED, WEAKLY_BELIEVED, WAITING, DOUBTED, REFUSED, HELD_OUT = range(len(STATES))
@@ -62,7 +67,7 @@ class Drive:
 
     odometry: Trajectory  # raw, `T_odom_base`
     corrected: Trajectory  # result, `T_map_base`
-    truth: Trajectory | None  # `T_map_base`; None if unknown
+    truth: Trajectory | None  # `T_map_base`, headings may be NaN; None if unknown
     fix_stamps_ns: IntArray  # (M,)
     fix_positions: Points  # in the map, (M, 2)
     fix_states: IntArray  # numbers of `STATES`, (M,)
@@ -73,6 +78,8 @@ class Drive:
     map_axes: tuple[str, str] = ('x', 'y')
     arrived_ns: 'Mapping[str, Sequence[StampNs]]' = field(default_factory=dict)
     """Stamps of what was measured and not held out, in the order of arrival, by source."""
+    odometry_heights: FloatArray = field(default_factory=lambda: np.zeros(0))   # [m]
+    truth_heights: FloatArray = field(default_factory=lambda: np.zeros(0))  # NaN: unknown [m]
     truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
 
     @property
@@ -108,7 +115,7 @@ class Drive:
                     ('fixes', truth, (self.fix_stamps_ns[~doubted], self.fix_positions[~doubted])),
                     ('doubted fixes', truth, of_kind['doubted']), ('corrected path', path, true)):
                 rows += error_rows(f'{name} to truth', distances(one, *other)[1])
-            inside = path.covers(truth.stamps_ns)
+            inside = path.covers(truth.stamps_ns) & np.isfinite(truth.poses[:, 2])
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(se2.wrap(
                 path.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2]))), 'deg')
         for kind in ('used', 'doubted', 'held out'):
@@ -117,16 +124,22 @@ class Drive:
         return rows
 
 
-def place_truth(drive: Drive) -> Drive:
-    """Return a drive with the truth moved rigidly to where it fits the corrected path best."""
-    truth = drive.truth
-    if truth is None or not np.any(inside := drive.corrected.covers(truth.stamps_ns)):
+def place_truth(drive: Drive, truth: Truth = UNKNOWN) -> Drive:
+    """Return a drive with its truth where that is compared with the corrected path."""
+    if drive.truth is None:
         return drive
-    before = truth.poses[inside, :2]
-    pose = fit_motion(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2])
-    placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
-    shift = np.mean(placed.poses[inside, :2] - before, axis=0)
-    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), abs(float(pose[2]))))
+    placed, turn = truth.placed(drive.truth, drive.corrected)
+    if turn is None:
+        return drive
+    inside = drive.corrected.covers(placed.stamps_ns)
+    shift = np.mean((placed.poses - drive.truth.poses)[inside, :2], axis=0)
+    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), turn))
+
+
+def with_truth(drive: Drive, truth: Truth, known: Heighted | None) -> Drive:
+    """Return a drive with the true poses, if they are known, where they are compared."""
+    return drive if known is None else place_truth(
+        replace(drive, truth=known[0], truth_heights=known[1]), truth)
 
 
 def distances(path: Trajectory, stamps_ns: IntArray,
@@ -142,6 +155,25 @@ def extent(path: Trajectory) -> tuple[float, float]:
     stamps, steps = path.stamps_ns, np.diff(path.poses[:, :2], axis=0)
     return (float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 0 else 0.0,
             float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+
+def lengths(drive: Drive) -> dict[str, float | None]:
+    """
+    Return the lengths of path, odometry and truth during the path [m], for JSON.
+
+    They are those in the plane, and with the heights of the poses where these are known.
+    """
+    found: dict[str, float | None] = {'path': extent(drive.corrected)[1]}
+    for name, path, heights in (('odometry', drive.odometry, drive.odometry_heights),
+                                ('truth', drive.truth, drive.truth_heights)):
+        found |= {name: None, f'{name}_with_heights': None}
+        if path is not None and np.any(inside := drive.corrected.covers(path.stamps_ns)):
+            flat = np.hypot(*np.diff(path.poses[inside, :2], axis=0).T)
+            up = np.diff(heights[inside]) if len(heights) == len(path) else np.zeros(0)
+            found[name] = float(np.sum(flat))
+            if np.any(up) and np.all(np.isfinite(up)):
+                found[f'{name}_with_heights'] = float(np.sum(np.hypot(flat, up)))
+    return found
 
 
 def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
@@ -164,7 +196,7 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     assert truth is not None, 'only a truth tells errors'
     inside = truth.covers(path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
     true, poses = truth.at(path.stamps_ns[inside]), path.poses[inside]
-    if np.any(inside) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
+    if np.any(np.isfinite(true[:, 2])) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
         # a truth may begin just after the fixed node: the surest one that it covers is as good
         surest = int(np.argmin(np.trace(covariances[inside], axis1=1, axis2=2)))
         true = se2.compose(se2.compose(poses[surest], se2.inverse(true[surest])), true)
@@ -173,7 +205,7 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     found: dict[str, dict[str, Any] | None] = {}
     for name, size in (('position', 2), ('pose', 3)):
         blocks = covariances[inside][:, :size, :size]
-        valid = np.linalg.eigvalsh(blocks)[:, 0] > 0.0
+        valid = (np.linalg.eigvalsh(blocks)[:, 0] > 0.0) & np.isfinite(errors[:, size - 1])
         e, n = errors[valid, :size, None], int(np.sum(valid))
         nees = np.sum(e * np.linalg.solve(blocks[valid], e), axis=(1, 2))
         # quantiles of chi-square
@@ -199,19 +231,11 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
     duration, distance = extent(drive.corrected)
     return {'duration_s': duration, 'distance_m': distance, 'odometry': len(drive.odometry),
-            'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
+            'lengths_m': lengths(drive), 'poses': len(drive.corrected), **{
+                f'fixes_{kind.replace(" ", "_")}': int(
                 np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
             'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
             'errors': [asdict(row) for row in drive.rows], **extra}
-
-
-def _path_of(samples: 'array[int]', poses: 'array[float]') -> Trajectory:
-    """Return samples as a path, the first one of equal stamps; of very many only some."""
-    stride = 1
-    while len(samples) // stride >= MOST_SAMPLES:
-        stride *= 2
-    stamps, first = np.unique(np.array(samples)[::stride], return_index=True)
-    return Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first])
 
 
 Measured = tuple[str, OdometrySample | Measurement, bool]
@@ -219,78 +243,98 @@ Measured = tuple[str, OdometrySample | Measurement, bool]
 
 
 def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
-                *, held_out: bool) -> Iterator[Measured]:
-    """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
+                *, held_out: bool, heights: 'array[float] | None' = None) -> Iterator[Measured]:
+    """
+    Yield the valid measurements of a bag, with those that are held out if they are wanted.
+
+    The height of each pose of the first odometry is added to the heights, NaN if it has no pose.
+    """
+    start_ns: StampNs | None = None
     for source, message, is_held_out in bags.read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
         try:
-            measurement = reader.read(source, message.decode())
+            content = message.decode()
+            measurement = reader.read(source, content)
         except MessageError:
             measurement = rejected('malformed', '')
         if isinstance(measurement, Answer):
             refused[source, measurement.reason] += 1
-        else:
-            yield source, measurement, is_held_out
+            continue
+        if isinstance(measurement, OdometrySample):
+            start_ns = measurement.stamp_ns if start_ns is None else start_ns
+            if heights is not None and source == inputs.odometry[0]:
+                heights.append(content.pose.pose.position.z
+                               if inputs.kinds[source] is ODOMETRY else np.nan)
+        is_in_stretch = (
+            inputs.stretch is not None and start_ns is not None
+            and isinstance(measurement, Fix | GlobalPose | Position) and noise.is_in_part(
+                measurement.stamp_ns, start_ns, inputs.stretch, inputs.hold_out - 1,
+                inputs.hold_out))
+        if held_out or not is_in_stretch:
+            yield source, measurement, is_held_out or is_in_stretch
 
 
 def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
-             truth_topic: str | None, *, origin: geodesy.MapOrigin | None,
+             truth: Truth = UNKNOWN, *, origin: geodesy.MapOrigin | None,
              refused: Collection[Key] | None = None) -> Drive:
     """
     Return the path of an engine together with the measurements of the bag that it is made of.
 
-    Without the `origin` of its map, the first fix on the path makes it. Raises `BagError` if
-    `truth_topic` is missing or of an unsupported type. Else as `collect_drive`.
+    Without the `origin` of its map, the first fix on the path makes it. Raises `BagError` if the
+    topic of the truth is missing or of an unsupported type. Else as `collect_drive`.
     """
     reader = reader_of(bag, values)
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    return place_truth(replace(
-        collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-                      inputs.odometry[0], refused),
-        map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
-        truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
+    heights = array('d')
+    drive = collect_drive(
+        measured_in(bag, inputs, reader, Counter(), held_out=True, heights=heights), backend,
+        inputs.odometry[0], refused, heights)
+    return with_truth(replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y')),
+                      truth, truth.read(bag, inputs.span, reader.datum.plane))
 
 
 def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
-                  odometry_source: str, refused: Collection[Key] | None) -> Drive:
+                  odometry_source: str, refused: Collection[Key] | None,
+                  heights: 'array[float] | None' = None) -> Drive:
     """
     Return the path of an engine together with the measurements that it is made of.
 
     Loop closures without a verdict are believed but for those that were `refused`; None if it is
-    not known which: then all of sources that are judged.
+    not known which: then all of sources that are judged. The heights of odometry may come in as
+    its samples are asked for.
     """
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
     loops, sources, held = list[Key](), list[str](), list[bool]()
     odometry = array('q'), array('d')
-    fixes = list[Fix | kinds.GlobalPose | kinds.Position]()
+    fixes = list[Fix | GlobalPose | Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         if not held_out:
             arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
-            case Fix() | kinds.GlobalPose() | kinds.Position():
+            case Fix() | GlobalPose() | Position():
                 fixes.append(measurement)
                 sources.append(source)
                 held.append(held_out)
-            case kinds.LoopClosure(stamp, _, _, int(reference)):
+            case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry[0].append(stamp)
                 odometry[1].extend(pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    arms = np.array([np.zeros(2) if isinstance(each, kinds.GlobalPose) else each.lever_arm
+    arms = np.array([np.zeros(2) if isinstance(each, GlobalPose) else each.lever_arm
                      for each in fixes]).reshape(-1, 2)
     inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
     # a fix that can have been used makes the datum, if there is none
     for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
         each = fixes[k]
         positions[k] = each.placed().position if isinstance(each, Fix) else (
-            each.pose[:2] if isinstance(each, kinds.GlobalPose) else each.position)
+            each.pose[:2] if isinstance(each, GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
@@ -308,30 +352,10 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
         # of several with one stamp the first one was added
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     refused = {key for key in loops if key[0] in judged} if refused is None else refused
+    path, known_heights = path_of(*odometry, heights or array('d'))
     return Drive(
-        _path_of(*odometry), corrected, None, stamps, positions,
+        path, corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
-        [source for source, _, _ in loops], arrived_ns=arrived)
-
-
-def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory:
-    """
-    Return the true poses that were recorded in a span; invalid messages are ignored.
-
-    Raises `BagError` if the topic is missing or of an unsupported type.
-    """
-    if (info := bag.topics.get(topic)) is None or info.type not in POSE_TYPES:
-        what = 'no topic' if info is None else f'type {info.type} of'
-        raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
-                       f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
-    samples, poses = array('q'), array('d')
-    for bag_message in bag.messages([topic], span):
-        with suppress(Exception):   # it may have other fields, by a definition in the bag
-            message = bag_message.decode()
-            pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
-            if not isinstance(pose, Answer):
-                samples.append(stamp_ns(message))
-                poses.extend(pose)
-    return _path_of(samples, poses)
+        [source for source, _, _ in loops], arrived_ns=arrived, odometry_heights=known_heights)

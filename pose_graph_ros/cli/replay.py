@@ -23,12 +23,19 @@ from pose_graph_ros.adapters import bags, output_cdr, sources
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, Inputs, MessageError, reader_of
 from pose_graph_ros.adapters.conversions import Datum, frame
-from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, MessageReader, Values
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, Values
 from pose_graph_ros.cli import shared
-from pose_graph_ros.cli.arguments import Exports, ON_EARTH
-from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
+from pose_graph_ros.cli.arguments import Exports, FULL, ON_EARTH
+from pose_graph_ros.cli.drive import (
+    collect_drive,
+    Drive,
+    drive_in,
+    measured_in,
+    with_truth,
+)
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
+from pose_graph_ros.cli.truth import truth_of
 from pose_graph_ros.core import alignment, exceptions
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
@@ -66,14 +73,19 @@ def require_datum(exports: Exports, *, known: bool) -> None:
             "'datum:=[LATITUDE, LONGITUDE]')")
 
 
-def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None) -> list[Path]:
+def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None,
+                  full: Trajectory | None = None) -> list[Path]:
     """
     Return the files that were written into a folder, `path.kitti` and so on.
 
+    The path is also given in full, with the poses between hidden nodes, if it is to be written.
     Raises `ExportError` if a format needs a place on the Earth, which is unknown, after all others
     are written.
     """
-    written, path = [], run.estimate.path
+    written, path = list[Path](), run.estimate.path
+    if full is not None:
+        written.append(folder / 'path_full.tum')
+        path_files.write_tum(full, written[-1])
     # before the first measurement in the map, its place on the Earth is unknown
     placed = (datum is not None and datum.plane is not None
               and run.estimate.alignment is not alignment.AlignmentState.LOCAL)
@@ -82,7 +94,7 @@ def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None)
             lines = path_files.kitti_lines(path)
         elif name == 'csv':
             lines = path_files.csv_lines(path, run.covariances)
-        elif placed:
+        elif placed and name in ON_EARTH:
             assert datum is not None
             places = datum.geodetic(path.poses[:, :2])[:, :2]
             lines = LINES[name](path.stamps_ns, places, run.title)
@@ -111,16 +123,8 @@ class _Corrector:
         self._has_poses = inputs.kinds[self._source] is KINDS['odometry']
         self.map_frame, self.odom_frame, self._base_frame = (
             frame(values[key]) for key in ('map_frame', 'odom_frame', 'base_link_frame'))
-        reader = MessageReader(values)
-
-        def samples() -> Iterator[tuple[int, Pose]]:
-            """Yield stamps and poses of odometry, if that has poses."""
-            for message in bag.messages([self.topic], inputs.span) if self._has_poses else ():
-                with suppress(MessageError):
-                    sample = reader.read(self._source, message.decode())
-                    if isinstance(sample, OdometrySample):
-                        yield sample.stamp_ns, _pose(sample)
-        self._correction = PathCorrection(path, interpolated(path, samples()))
+        self.correction = PathCorrection(path, interpolated(
+            path, _samples(bag, inputs, run) if self._has_poses else ()))
         self._stamps, self._covariances = path.stamps_ns.tolist(), run.covariances
         self._newest_ns = 0
         # from the first message on again, as it remembers the stamps before
@@ -135,7 +139,7 @@ class _Corrector:
         if not isinstance(sample := self._reader.read(self._source, source), OdometrySample):
             return
         stamp_ns, odometry = sample.stamp_ns, _pose(sample)
-        if (pose := self._correction.at(stamp_ns, odometry)) is None:
+        if (pose := self.correction.at(stamp_ns, odometry)) is None:
             return
         covariance = self._covariances[bisect.bisect_right(self._stamps, stamp_ns) - 1]
         yield ODOMETRY, output_cdr.odometry_cdr(
@@ -146,6 +150,16 @@ class _Corrector:
             self._newest_ns = stamp_ns
             yield TF, output_cdr.transform_cdr(stamp_ns, np.array(compose_one(
                 pose, between_one(odometry, (0.0, 0.0, 0.0)))), self.map_frame, self.odom_frame)
+
+
+def _samples(bag: Bag, inputs: Inputs, run: Run) -> Iterator[tuple[int, Pose]]:
+    """Yield stamps and poses of the primary odometry."""
+    source, reader = run.estimate.primary, reader_of(bag, run.values)
+    for message in bag.messages([inputs.topics[source]], inputs.span):
+        with suppress(MessageError):
+            sample = reader.read(source, message.decode())
+            if isinstance(sample, OdometrySample):
+                yield sample.stamp_ns, _pose(sample)
 
 
 def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> dict[str, int]:
@@ -269,10 +283,10 @@ def execute(options: argparse.Namespace) -> int:
 
 def _execute_bags(options: argparse.Namespace) -> int:
     """Replay bags."""
-    values = shared.parameter_values(options)
+    values, truth = shared.parameter_values(options), truth_of(options)
     with ExitStack() as stack:
         bag = stack.enter_context(bags.open_bag(*options.bags))
-        inputs = shared.inputs_of(bag, options, values, options.hold_out)
+        inputs = shared.inputs_of(bag, options, values, options.hold_out, options.stretch)
         require_datum(options.export, known=len(values['datum']) > 0 or len(inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
             BagWriter(options.new_bag, latched=LATCHED))
@@ -291,15 +305,19 @@ def _execute_bags(options: argparse.Namespace) -> int:
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
         plane = reader.datum.plane
         done = _run_of(options, result, drive_in(
-            shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, options.truth,
+            shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, truth,
             origin=None if plane is None else plane.origin, refused=result.refused),
             values, inputs.kinds)
+        full = None
+        if FULL in options.export.formats:
+            full = done.estimate.path.filled(_Corrector(bag, inputs, done).correction, _samples(
+                shared.watched_bag(bag, 'writing the path'), inputs, done))
         facts: dict[str, Any] = {
             'bags': [str(path) for path in options.bags], 'seconds': result.seconds}
         if writer is not None:
             facts['new_bag'] = write_corrected(
                 writer, shared.watched_bag(bag, 'writing the bag'), inputs, done)
-    return _report(options, done, facts, reader.datum, live)
+    return _report(options, done, facts, reader.datum, live, full=full)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -308,15 +326,23 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
                        '--from and --until')
     require_datum(options.export, known=False)
-    values = shared.parameter_values(options, {'odom.noise': 'twist'})
+    values, truth = shared.parameter_values(options, {'odom.noise': 'twist'}), truth_of(options)
+    if truth.topic is not None:
+        raise BagError(f'--truth {truth.topic}: {options.bags[0]} has no topics; name a file')
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
                     for each in read_measurements(options.bags[0], options.edge2)]
     result = run(measurements, values)
     drive = collect_drive(
         ((*each, False) for each in measurements), result.backend, odometry, result.refused)
+    drive = with_truth(drive, truth, truth.read(None))
+    samples = [(each.stamp_ns, _pose(each)) for _, each in measurements
+               if isinstance(each, OdometrySample)]
+    path, is_full = drive.corrected, FULL in options.export.formats
     return _report(options, _run_of(options, result, drive, values, {
-        odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}), {'seconds': result.seconds})
+        odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}), {'seconds': result.seconds},
+        full=path.filled(PathCorrection(path, interpolated(path, samples)), samples)
+        if is_full else None)
 
 
 def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
@@ -327,11 +353,12 @@ def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values:
 
 
 def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
-            datum: Datum | None = None, live: LivePoses | None = None) -> int:
+            datum: Datum | None = None, live: LivePoses | None = None, *,
+            full: Trajectory | None = None) -> int:
     """Write the results and print a summary; return the exit code."""
     lines = document.write_results(done, options.out, facts)
     g2o.write_g2o(done.backend.graph, options.out / 'graph.g2o')
-    exported = write_exports(options.export, options.out, done, datum)
+    exported = write_exports(options.export, options.out, done, datum, full)
     if live is not None:
         exported.append(options.out / 'live.csv')
         poses = np.array([each.T_map_base for each in live.values()]).reshape(-1, 3)

@@ -34,10 +34,10 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')  # keys of run.json that --json prints
-OF_REPLAY = ('begin', 'until', 'edge2', 'params_file', 'truth', *bags.OPTIONS,
-             'param', 'hold_out')  # of bags alone
+OF_REPLAY = ('begin', 'until', 'edge2', 'params_file', 'truth', 'align', *bags.OPTIONS,
+             'param', 'hold_out', 'stretch')  # of bags alone
 PAGES = ('.html', '.htm')
-BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
+BAG_SUFFIXES = (*bags.BAG_FILE_SUFFIXES, '.g2o', '.graph')
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -84,7 +84,8 @@ def _file(options: argparse.Namespace) -> Path | None:
             raise FileFormatError(f'{first}: expected {FILE}, or a file with the suffix '
                                   f'{", ".join(BAG_SUFFIXES)}')
         return None
-    if len(given := [name for name in OF_REPLAY if getattr(options, name)]) > 0:
+    if len(given := [name for name in OF_REPLAY if (
+            value := getattr(options, name)) or value is False]) > 0:
         option = {'begin': 'from'}.get(given[0], given[0]).replace('_', '-')
         raise ConfigError(f'--{option}: {first} has been run already; the option is for a bag')
     return file

@@ -5,6 +5,7 @@
 import argparse
 from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
+from dataclasses import replace
 import math
 from pathlib import Path
 import sys
@@ -14,6 +15,8 @@ from pose_graph_ros.adapters import bags
 from pose_graph_ros.adapters.parameters import checked, yaml_value
 from pose_graph_ros.adapters.sources import source_list, Values
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.judgement.texts import short
+from pose_graph_ros.core.quantities import Seconds
 
 DELAY = 0.5  # after which a bar appears [s]
 Item = TypeVar('Item')
@@ -75,7 +78,7 @@ def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]
 
 
 def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,
-              hold_out: int = 0) -> bags.Inputs:
+              hold_out: int = 0, stretch: Seconds | None = None) -> bags.Inputs:
     """Return what is read of a bag by the options; raises `BagError` if that is nothing."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
@@ -83,8 +86,24 @@ def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,
     if (options.begin or 0.0) >= min(length, math.inf if options.until is None else options.until):
         raise bags.BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                             f'recording is {max(length, 0.0):.3f} s long')
-    return bags.choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
-                              bags.Span(*limits), truth=options.truth)
+    inputs = bags.choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
+                              bags.Span(*limits), truth=options.truth if isinstance(
+                                  options.truth, str) else None)
+    if hold_out == 0 or stretch is None:
+        if stretch is not None:
+            raise ConfigError('--stretch: expected --hold-out N, which says how many are held out')
+        return inputs
+    check_stretch(bag.path, stretch, min(length, math.inf if options.until is None else
+                                         options.until) - (options.begin or 0.0), hold_out)
+    return replace(inputs, stretch=stretch)
+
+
+def check_stretch(path: str, stretch: Seconds | None, duration: Seconds, parts: int) -> None:
+    """Raise `BagError` if stretches are so long that one of the parts would have none."""
+    if stretch is not None and stretch > duration / parts:
+        raise bags.BagError(
+            f'{path}: expected stretches of at most {short(duration / parts)} s, '
+            f'as it lasts {short(duration)} s in {parts} parts, got {short(stretch)}')
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:

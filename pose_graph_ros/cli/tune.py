@@ -12,7 +12,7 @@ part in these.
 
 import argparse
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from enum import Enum
 from itertools import islice
 import json
@@ -28,15 +28,15 @@ from pose_graph_ros.adapters.bags import Bag, BagError, Inputs, open_bag, reader
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU, Values
 from pose_graph_ros.cli import finite, shared, tuned_parameters
-from pose_graph_ros.cli.drive import distances, measured_in, read_truth
+from pose_graph_ros.cli.drive import distances, measured_in
 from pose_graph_ros.cli.replay import run
+from pose_graph_ros.cli.truth import truth_of
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
 from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
@@ -47,6 +47,8 @@ from pose_graph_ros.offline.source_residuals import ScaleFit
 from pose_graph_ros.offline.variance_components import analyse
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
+TruthAt = Callable[[Trajectory], Trajectory]
+"""Return the truth where it is compared with a path."""
 LEAST = 20  # measurements of a source whose noise is estimated
 IN_MEMORY = 1_000_000  # measurements, of 700 bytes each
 OF_CLOSURES = Claims(is_constant=False, is_scalable=True, sigma=0.0, sigma_heading=0.0)
@@ -82,7 +84,9 @@ class Tuning:
         self._inputs, self._values = inputs, values
         self._step, self._steps = 0, 0
         self._path = bag.path
-        stream = measured_in(bag, inputs, reader_of(bag, values), Counter(), held_out=False)
+        reader = reader_of(bag, values)
+        self.datum = reader.datum
+        stream = measured_in(bag, inputs, reader, Counter(), held_out=False)
         self._measurements = [each[:2] for each in islice(stream, IN_MEMORY)]
         self.is_cut = next(stream, None) is not None  # whether the bag has more
         moves = [(name, each.stamp_ns) for name, each in self._measurements
@@ -101,6 +105,7 @@ class Tuning:
             raise BagError(f'{self._path}: no usable odometry on {topics}')
         stamps = [stamp_ns for name, stamp_ns in moves if name == self._odometries[0]]
         self._start_ns, self._duration = min(stamps), (max(stamps) - min(stamps)) * 1e-9
+        self.span = Trajectory(np.array([min(stamps), max(stamps)]), np.zeros((2, 3)))
         valid = self._valid(values)
         self._repaired = {name for name, _, is_repaired in valid if is_repaired}
         every = {name: [each for of, each, _ in valid if of == name]
@@ -116,12 +121,9 @@ class Tuning:
                 raise BagError(f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, '
                                f'global poses or loop closures are needed; used are {topics}')
 
-    def tune(self, folds: int, truth: Trajectory | None, stretch: Seconds | None) -> Outcome:
+    def tune(self, folds: int, truth: TruthAt | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
-        if stretch is not None and stretch > self._duration / folds:
-            raise BagError(
-                f'{self._path}: expected stretches of at most {short(self._duration / folds)} s, '
-                f'as it lasts {short(self._duration)} s in {folds} parts, got {short(stretch)}')
+        shared.check_stretch(self._path, stretch, self._duration, folds)
         # what the settings before say is not looked for by the engine: it shows in other runs
         self._looking = {**self._values, **{
             f'{name}.correlation_time': -1.0 for name in self._sources
@@ -234,7 +236,7 @@ class Tuning:
             *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0 for each in both))
 
     def _fold(self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
-              truth: Trajectory | None) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
+              truth: TruthAt | None) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
         """
         Return errors of the paths before and after at a part that is held out, and to the truth.
 
@@ -243,8 +245,8 @@ class Tuning:
         every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
                  if not isinstance(each, HeadingOnly)]
         every += [(name, each.stamp_ns) for name, each in self._closures]
-        left_out = {key for key in every if int(
-            (key[1] - self._start_ns) * 1e-9 / stretch) % folds == k}
+        left_out = {key for key in every
+                    if noise.is_in_part(key[1], self._start_ns, stretch, k, folds)}
         text = f'part {k + 1} of {folds} held out'
         before, runs = self._runs(text, left_out)
         values = checked({**self._values, **changed(self._estimate(runs, doubted)[0])})
@@ -256,9 +258,10 @@ class Tuning:
             common = np.intersect1d(*(each.stamps_ns for each in errors))
             one, other = (each.rows(np.isin(each.stamps_ns, common)) for each in errors)
             pairs.append((one, other))
-        return pairs, [] if truth is None else [float(np.sqrt(np.mean(np.square(
-            distances(self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
-            for _, backend in tried]
+        paths = [self._path_of(backend)[0] for _, backend in tried]
+        return pairs, [] if truth is None else [float(np.sqrt(np.mean(np.square(distances(
+            path, true.stamps_ns, true.poses[:, :2])[1])))) for path in paths
+            for true in [truth(path)]]
 
     def _path_of(self, backend: PoseGraphBackend) -> tuple[Trajectory, Covariances]:
         estimate = backend.estimate()
@@ -308,7 +311,7 @@ def _shown(fit: ScaleFit | None, axis: int | None = None) -> Found | None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    start, values = time.monotonic(), shared.parameter_values(options)
+    start, values, truth = time.monotonic(), shared.parameter_values(options), truth_of(options)
     if options.out.is_dir():
         raise BagError(f'{options.out}: is a folder; expected a file to write')
     if not options.out.resolve().parent.is_dir():
@@ -318,10 +321,13 @@ def execute(options: argparse.Namespace) -> int:
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bag(*options.bags) as bag:
         inputs = shared.inputs_of(bag, options, values)
-        truth = None if options.truth is None else read_truth(bag, options.truth)
         tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values)
+        known = truth.read(bag, inputs.span, tuning.datum.plane)
+    if known is not None:
+        truth.placed(known[0], tuning.span)     # so that wrong times are said at once
     try:
-        outcome = tuning.tune(options.folds, truth, options.stretch)
+        outcome = tuning.tune(options.folds, None if known is None else lambda path: truth.placed(
+            known[0], path)[0], options.stretch)
     finally:
         _show('')
     names = ' '.join(each.name for each in options.bags)

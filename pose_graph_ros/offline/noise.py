@@ -295,6 +295,12 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     return min(wanted, duration / (LEAST_STRETCHES * folds))
 
 
+def is_in_part(stamp_ns: StampNs, start_ns: StampNs, stretch: float, part: int,
+               parts: int) -> bool:
+    """Tell whether a stamp lies in one of the stretches of a part, every `parts`-th of them."""
+    return int((stamp_ns - start_ns) * 1e-9 / stretch) % parts == part
+
+
 def errors_at(path: Trajectory, covariances: FloatArray, held_out: Sequence[Position | GlobalPose],
               factor: float) -> Errors:
     """

@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from bag_of_messages import write_bag
-from circle_bag import fixes, odometry
+from circle_bag import circle, fixes, odometry
 import numpy as np
 import pyproj
 import pytest
@@ -17,6 +17,7 @@ from tum_files import read_tum
 
 from pose_graph_ros.cli.arguments import FORMATS, replay
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.core.geometry import se2
 
 DATUM = 50.7, 7.1, 0.3
 ALTITUDE = 60.0
@@ -85,6 +86,21 @@ def test_the_table_has_path_and_covariances(results) -> None:
         assert 0.0 < xx < 0.1
 
 
+def test_the_full_path_is_that_of_odometry_through_the_nodes(results, tmp_path) -> None:
+    path, full = read_tum(results / 'path.tum'), read_tum(results / 'path_full.tum')
+    np.testing.assert_array_equal(full.stamps_ns, circle().stamps_ns)
+    np.testing.assert_array_equal(full.at(path.stamps_ns), path.poses)
+    true = se2.compose(np.array((0.0, 0.0, -DATUM[2])), circle().poses)
+    far = [np.max(np.hypot(*(each.at(full.stamps_ns) - true).T[:2])) for each in (path, full)]
+    assert far[1] < 0.005
+    assert far[0] > 0.01    # a chord of 1 m is 12 mm inside of the circle
+    graph = tmp_path / 'graph.g2o'
+    graph.write_text(''.join(
+        f'EDGE_SE2 {k} {k + 1} 0.01 0 0 400 0 0 400 0 2500\n' for k in range(300)))
+    assert main(['replay', str(graph), '-o', str(tmp_path), '--export', 'tum_full']) == 0
+    assert len(read_tum(tmp_path / 'path_full.tum')) == 301 > len(read_tum(tmp_path / 'path.tum'))
+
+
 def test_evo_reads_tum_and_kitti(results) -> None:
     evo = pytest.importorskip('evo.tools.file_interface', reason='evo is not there')
     path = read_tum(results / 'path.tum')
@@ -112,8 +128,8 @@ def test_without_a_datum_there_is_no_place_on_the_earth(tmp_path, capsys) -> Non
     assert (tmp_path / 'out' / 'path.csv').exists()
     assert main([*words, 'all']) == 0
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
-        'path.tum', 'path.csv', 'path.kitti', 'graph.g2o', 'drive.png', 'summary.json',
-            'run.json'}
+        'path.tum', 'path_full.tum', 'path.csv', 'path.kitti', 'graph.g2o', 'drive.png',
+        'summary.json', 'run.json'}
 
 
 def test_covariances_are_empty_where_nodes_have_left_the_graph(tmp_path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.cli.graph_input import read_measurements
+from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
@@ -60,3 +61,16 @@ def test_a_graph_without_odometry_is_refused_by_the_vertices(tmp_path) -> None:
     path.write_text(f'EDGE_SE2 0 1 {STEP}\nEDGE_SE2 0 7 {LOOP}\n')
     with pytest.raises(FileFormatError, match='there is none from 1 to 7'):
         read_measurements(path)
+
+
+@pytest.mark.parametrize('words', [
+    ['solve'], ['replay'], ['report'], ['draw', '-o', 'a.svg'],
+    ['marginalize', '--nodes', '0', '-o', 'a.g2o']])
+def test_a_graph_in_space_is_refused_by_what_can_be_done(words, tmp_path, capsys) -> None:
+    path = tmp_path / 'sphere.g2o'
+    path.write_text('# a comment\nVERTEX_TRACKXYZ 5 0 0 0\nVERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n')
+    assert main([words[0], str(path), *words[1:]]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f'error: {path}:3: VERTEX_SE3:QUAT is of a graph in space (3D)')
+    assert 'write x, y and yaw as VERTEX_SE2 and EDGE_SE2' in error
+    assert error.count('\n') == 1

@@ -20,13 +20,14 @@ from pose_graph_ros.adapters.bags import BagError, choose_inputs, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import replay
-from pose_graph_ros.cli.drive import drive_in, read_truth, REFUSED
+from pose_graph_ros.cli.drive import drive_in, REFUSED
 from pose_graph_ros.cli.main import guarded, main
 from pose_graph_ros.cli.simulate import (
     loop_closure_messages,
     Message,
     odometry_messages,
 )
+from pose_graph_ros.cli.truth import read_truth
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -155,7 +156,7 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
         result = replayed_bag(bag, inputs, values)
-        drive = drive_in(bag, inputs, values, result.backend, None, origin=None,
+        drive = drive_in(bag, inputs, values, result.backend, origin=None,
                          refused=result.refused)
     assert result.backend.counts['loop_closure', 'before_window'] == 1
     assert drive.loop_states.tolist() == [REFUSED]
@@ -168,7 +169,7 @@ def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(datum, axes,
     values = checked({'datum': datum})
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
-        drive = drive_in(bag, inputs, values, replayed_bag(bag, inputs, values).backend, None,
+        drive = drive_in(bag, inputs, values, replayed_bag(bag, inputs, values).backend,
                          origin=None)
     assert drive.map_axes == axes
     assert drive.truth is None
@@ -185,11 +186,45 @@ def test_truth_is_read_from_each_type_with_a_pose(type_name, tmp_path) -> None:
     broken = [('/truth', type_name, int(path.stamps_ns[5]), b'\0\1\0\0junk')]
     write_bag(tmp_path / 'bag', (*odometry(), *messages, *broken))
     with open_bag(tmp_path / 'bag') as bag:
-        truth = read_truth(bag, '/truth')
+        truth, heights = read_truth(bag, '/truth')
         np.testing.assert_array_equal(truth.stamps_ns, path.stamps_ns[::10])
         np.testing.assert_allclose(truth.poses, path.poses[::10], atol=1e-12)
+        assert heights.tolist() == [0.0] * len(truth)
         with pytest.raises(BagError, match=r'no topic /nothing \(--truth\)'):
             read_truth(bag, '/nothing')
+
+
+def test_lengths_are_those_in_the_plane_beside_those_with_heights(tmp_path, capsys) -> None:
+    steep, truth = odometry(), pose_messages('/truth', POSE)
+    for k, (_, _, _, message) in enumerate(steep):
+        message.pose.pose.position.z = 0.02 * k     # of 0.2 m
+    write_bag(tmp_path / 'bag', (*steep, *fixes(np.zeros(2)), *truth))
+    words = tmp_path / 'bag', '-o', tmp_path / 'out'
+    assert run(*words, '--truth', '/truth') == 0
+    assert 'length of odometry: ' in (told := capsys.readouterr().out)
+    assert 'length of truth' not in told
+    found = summary_of(tmp_path / 'out')['lengths_m']
+    assert found['path'] == pytest.approx(79.8, abs=0.2)
+    assert found['odometry'] == pytest.approx(1.01 * 399 * 0.2, abs=0.01)
+    assert found['odometry_with_heights'] == pytest.approx(
+        399 * np.hypot(0.02, 1.01 * 0.2), abs=0.01)
+    assert found['truth'] == pytest.approx(390 * 0.2 * np.sin(0.1) / 0.1, abs=0.01)
+    assert found['truth_with_heights'] is None
+
+
+def test_the_length_of_a_truth_with_heights_is_that_of_evo_while_the_path_lasts(tmp_path) -> None:
+    evo = pytest.importorskip('evo.tools.file_interface', reason='evo is not there')
+    write_bag(tmp_path / 'bag', odometry())
+    file = tmp_path / 'truth.tum'
+    file.write_text('1 0 0 0 0 0 0 1\n' + ''.join(
+        f'{stamp / 1e9:.6f} {k} 0 {0.1 * k} 0 0 0 1\n' for k, stamp in enumerate(
+            circle().stamps_ns[::10].tolist())))
+    assert run(tmp_path / 'bag', '-o', tmp_path / 'out', '--truth', file) == 0
+    truth = evo.read_tum_trajectory_file(str(file))
+    truth.reduce_to_ids(range(1, 41))
+    found = summary_of(tmp_path / 'out')['lengths_m']
+    assert found['truth_with_heights'] == pytest.approx(truth.path_length, abs=1e-9)
+    assert found['truth'] == pytest.approx(39.0, abs=1e-9)
 
 
 def test_a_bag_without_usable_odometry_is_one_line_of_error(tmp_path, capsys) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`pose-graph replay` of bags of ROS 1 and ROS 2, compressed, in parts, and wrong ones."""
 
+import json
 from pathlib import Path
 import sys
 
@@ -16,6 +17,7 @@ from tum_files import read_tum
 from pose_graph_ros.adapters.bags import choose_inputs, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.cli.drive import HELD_OUT
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.shared import watched_bag
 from pose_graph_ros.cli.simulate import Message
@@ -91,7 +93,7 @@ def test_wrong_bags_are_one_line_that_names_them(tmp_path, capsys) -> None:
     good = tmp_path / 'good'
     write_bag(good, drive())
     whole = write_ros1(tmp_path / 'whole.bag', drive()).read_bytes()
-    for name, data in (('cut.bag', whole[:len(whole) // 2]), ('text.bag', b'something else')):
+    for name, data in (('cut.bag', whole[:4000]), ('text.bag', b'something else')):
         (tmp_path / name).write_bytes(data)
         text = error_of(capsys, good, tmp_path / name)
         assert text.startswith(f'error: {tmp_path / name}: damaged, cut short or not supported')
@@ -141,3 +143,16 @@ def test_topics_of_ros_1_without_a_slash_can_be_named(named, tmp_path) -> None:
     by_option = replayed(tmp_path / 'option', bag, '--odom', named)
     by_parameter = replayed(tmp_path / 'parameter', bag, '-p', f'odom.topic:={named}')
     assert by_option == by_parameter
+
+
+def test_whole_stretches_of_the_drive_are_held_out(tmp_path, capsys) -> None:
+    write_bag(tmp_path / 'bag', drive())
+    replayed(tmp_path / 'out', tmp_path / 'bag', '--hold-out', 4, '--stretch', 5)
+    fixes_there, = json.loads((tmp_path / 'out' / 'run.json').read_text())['fixes']
+    # the fourth stretch and the eighth, of 5 s each
+    assert [state == HELD_OUT for state in fixes_there['state']] == [
+        15.0 <= t < 20.0 or t >= 35.0 for t in fixes_there['t']]
+    assert fixes_there['state'].count(HELD_OUT) == 20
+    for words, said in ((('--stretch', 5), 'expected --hold-out N'),
+                        (('--hold-out', 4, '--stretch', 11), 'at most 10 s')):
+        assert said in error_of(capsys, tmp_path / 'bag', *words)

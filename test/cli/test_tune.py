@@ -89,6 +89,14 @@ def test_a_part_may_have_all_fixes(tmp_path, capsys) -> None:
     assert not (tmp_path / 'tuned.yaml').exists()
 
 
+def test_a_part_of_the_bag_is_tuned_by(overconfident, tmp_path, capsys) -> None:
+    words = 'tune', str(overconfident), '-o', str(tmp_path / 'tuned.yaml'), '--folds', '2'
+    assert main([*words, '--from', '20', '--until', '80']) in (0, 1)
+    assert '\n60 s of odometry, 60 of fix;' in capsys.readouterr().out
+    assert main([*words, '--from', '80', '--until', '20']) == 2
+    assert 'nothing was recorded between --from and --until' in capsys.readouterr().err
+
+
 def test_progress_has_a_total(tuned) -> None:
     steps = re.findall(r'step (\d+) of (\d+): ', tuned[2])
     assert [int(step) for step, _ in dict.fromkeys(steps)] == list(range(1, len(set(steps)) + 1))

@@ -23,8 +23,8 @@ from rosbags.typesys import get_typestore, Stores
 
 from pose_graph_ros.adapters import bags, parameters, sources
 from pose_graph_ros.adapters.bags import BagMessage, MessageError, open_bag
-from pose_graph_ros.cli.drive import POSE_TYPES, read_truth
 from pose_graph_ros.cli.shared import parameter_values
+from pose_graph_ros.cli.truth import POSE_TYPES, read_truth
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig

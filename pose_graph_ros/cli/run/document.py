@@ -193,6 +193,11 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     if 'new_bag' in facts:
         lines.append('new bag: {original} messages copied, {left_out} left out, {corrected} poses '
                      'of odometry corrected'.format(**facts['new_bag']))
+    far = drives.lengths(drive)
+    lines += [f'length of {name}: {far[name]:.2f} m in the plane, where that of the path is '
+              f'{far["path"]:.2f} m; {steep:.2f} m with its heights'
+              for name in ('odometry', 'truth')
+              if (steep := far[f'{name}_with_heights']) is not None]
     return [*lines, 'counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()),
             '', drives.format_table(drive.rows),
             *(f'NEES of the {name}: ' + ('no valid covariance' if each is None else (

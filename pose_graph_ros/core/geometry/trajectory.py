@@ -4,6 +4,7 @@
 Sequences of stamped poses: interpolation, alignment, and the odometry in between.
 """
 
+from array import array
 import bisect
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -47,6 +48,18 @@ class Trajectory:
         if len(self) > 0 and stamp_ns <= self.stamps_ns[-1]:
             return self
         return Trajectory(np.append(self.stamps_ns, stamp_ns), np.vstack((self.poses, pose)))
+
+    def filled(self, correction: 'PathCorrection',
+               samples: Iterable[tuple[int, Pose]]) -> 'Trajectory':
+        """Return the path with the corrected poses of odometry at further stamps [ns] inside."""
+        stamps = array('q', self.stamps_ns.tolist())
+        poses = array('d', self.poses.ravel().tolist())
+        for stamp_ns, odometry in samples:
+            if (pose := correction.at(stamp_ns, odometry)) is not None:
+                stamps.append(stamp_ns)
+                poses.extend(pose)
+        every, first = np.unique(np.array(stamps), return_index=True)
+        return Trajectory(every, np.array(poses).reshape(-1, 3)[first])
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -156,8 +156,11 @@ def _raise_first(path: Path, found: dict[str, list[list[Any]]]) -> NoReturn:
 def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
     for tag, found in skipped.items():
         if 'SE3' in tag or tag in {'VERTEX3', 'EDGE3'}:
-            raise FileFormatError(f'{path}:{found[0][0]}: {tag} is of a graph in space (3D), '
-                                  f'which is not supported: graphs are planar (SE2)')
+            raise FileFormatError(
+                f'{path}:{found[0][0]}: {tag} is of a graph in space (3D), which is not '
+                'supported: graphs are planar (SE2). Of a robot on level ground, write x, y and '
+                'yaw as VERTEX_SE2 and EDGE_SE2; solve others with g2o or GTSAM')
+    for tag, found in skipped.items():
         raise FileFormatError(
             f'{path}:{found[0][0]}: tag {tag!r} is not known, and there is no line with one of '
             f'{", ".join(TAGS)}')

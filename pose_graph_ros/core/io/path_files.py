@@ -2,22 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Text of files with a path: KITTI, CSV with covariances, TUM, and GeoJSON, KML and GPX."""
 
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
 import json
 import math
 from pathlib import Path
-from typing import Any
+import re
+from typing import Any, NamedTuple
 from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.measurements import LARGEST_COORDINATE
 
 PART = 10_000  # rows that are written at once
 _XML = '<?xml version="1.0" encoding="UTF-8"?>'
 CREATOR = 'pose_graph_ros'
+TUM = 'stamp', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'
+_SAME = {'t': 'stamp', 'time': 'stamp', 'timestamp': 'stamp', 'lat': 'latitude',
+         'lon': 'longitude', 'altitude': 'z', 'theta': 'yaw'}
+"""Other names of columns."""
+_LARGEST = {'stamp': 2**63 / 1e9, 'latitude': 90.0, 'longitude': 360.0}
 
 
 def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
@@ -112,3 +122,78 @@ def geojson_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterato
     for k, (_, _, time) in enumerate(_points(stamps_ns, places)):
         yield f'"{time}"{"," if k < last else ""}'
     yield ']}}}]}'
+
+
+class PathFile(NamedTuple):
+    """Poses as they stand in a file, in the order of their stamps; NaN for what it has not."""
+
+    stamps_ns: IntArray  # strictly increasing, shape (N,)
+    places: FloatArray  # x, y, z [m], or latitude, longitude [degrees], altitude [m], (N, 3)
+    headings: FloatArray  # (N,) [rad]
+    is_on_earth: bool
+
+
+def read_path(path: Path) -> PathFile:
+    """
+    Return what is in a TUM file, or in a .csv file whose columns a header names.
+
+    Lines that are empty or begin with # are left out. Raises FileFormatError.
+    """
+    is_table, stamps_ns, values = path.suffix == '.csv', array('q'), array('d')
+    header: tuple[str, ...] = () if is_table else TUM
+    try:
+        lines = path.read_text(encoding='utf-8-sig').splitlines()
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f'{path}: no text') from error
+    for number, line in enumerate(lines, 1):
+        where = f'{path}:{number}'
+        if len(header) == 0 and line.strip() != '':
+            header = _header(where, line)
+        elif line.strip() != '' and not line.lstrip().startswith('#'):
+            words = line.split(',' if is_table else None)
+            if len(words) != len(header):
+                raise FileFormatError(f'{where}: expected {len(header)} values, '
+                                      f'{" ".join(header)}, got {len(words)}')
+            stamp_ns, row = _row(where, dict(zip(header, words, strict=True)))
+            stamps_ns.append(stamp_ns)
+            values.extend(row)
+    if len(stamps_ns) == 0:
+        raise FileFormatError(f'{path}: holds no pose')
+    stamps, first = np.unique(np.array(stamps_ns), return_index=True)
+    table = np.array(values).reshape(-1, 4)[first]
+    return PathFile(stamps, table[:, :3], table[:, 3], 'latitude' in header)
+
+
+def _header(where: str, line: str) -> tuple[str, ...]:
+    """Return the names of the columns, without units; none for a comment."""
+    words = (re.split(r'[\s\[(]', word.strip(), maxsplit=1)[0].lower()
+             for word in line.lstrip(' #').split(','))
+    names = tuple(_SAME.get(word, word) for word in words)
+    if {'stamp', 'x', 'y'} <= {*names} or {'stamp', 'latitude', 'longitude'} <= {*names}:
+        return names
+    if line.lstrip().startswith('#'):
+        return ()
+    raise FileFormatError(f'{where}: expected a header with the columns stamp, x, y or stamp, '
+                          f'latitude, longitude, got {line.strip()[:80]!r}')
+
+
+def _row(where: str, words: Mapping[str, str]) -> tuple[int, list[float]]:
+    """Return the stamp [ns], and place and heading in a line."""
+    values = {}
+    for name in {'stamp', 'latitude', 'longitude', 'yaw', *TUM} & {*words}:
+        text, most = words[name].strip(), _LARGEST.get(name, LARGEST_COORDINATE)
+        try:
+            values[name] = float(text)
+        except ValueError:
+            values[name] = math.nan
+        if not abs(values[name]) <= most:
+            unit = ' in seconds' if name == 'stamp' else ''
+            raise FileFormatError(f'{where}: expected {name}{unit}, a number of at most '
+                                  f'{most:.3g}, got {text[:40]!r}')
+    x, y, z, w = (values.get(name, math.nan) for name in TUM[4:])
+    if x == y == z == w == 0.0:
+        raise FileFormatError(f'{where}: the quaternion is zero')
+    yaw = values.get('yaw', math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
+    at = ('latitude', 'longitude', 'z') if 'latitude' in words else TUM[1:4]
+    return round(Decimal(words['stamp'].strip()) * 1_000_000_000), [
+        *(values.get(name, math.nan) for name in at), yaw]
