@@ -171,7 +171,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
       pose-graph solve graph.graph --edge2 toro --start best
       pose-graph solve graph.g2o --marginals newest
       pose-graph solve graph.g2o --marginals all -o covariances.csv --json
-      pose-graph solve graph.g2o --robust -o optimised.g2o
+      pose-graph solve graph.g2o --robust -o optimised.g2o --picture graph.png
       pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
 
     exit code: 0 converged, 1 not converged, 2 wrong input
@@ -190,6 +190,8 @@ def solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--marginals', metavar='{all,newest,IDS}',
                         help='covariances of these nodes, such as 3,7,20:25, as CSV: the last '
                              'output, or -o FILE.csv (default, with such a file: all)')
+    parser.add_argument('--picture', metavar='FILE', type=_picture, help='.svg or .png file of '
+                        'the graph before and after, its loop closures by their error')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools/solve.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, '
