@@ -19,6 +19,7 @@ class SolvedGraph(NamedTuple):
 
     ids: IntArray  # in the file, increasing
     is_pose: BoolArray  # else a landmark
+    is_fixed: BoolArray
     before: Poses
     after: Poses
     factors: Factors
@@ -43,7 +44,8 @@ def solved_graph(problem: 'Problem', before: Poses, chi2_before: float, result: 
     if len(doubted) > 0:
         squares[doubted] = problem.engine.unweighted_energies(doubted)
     return SolvedGraph(
-        problem.ids, graph.is_pose, before, graph.poses.copy(), factors, np.sqrt(squares),
+        problem.ids, graph.is_pose, graph.fixed, before, graph.poses.copy(), factors,
+        np.sqrt(squares),
         (factors.kind <= FactorKind.LOOP_CLOSURE) & (
             np.abs(place[factors.j] - place[factors.i]) == 1),
         np.isin(np.arange(len(factors)), doubted), chi2_before, result)
