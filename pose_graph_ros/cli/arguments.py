@@ -73,22 +73,29 @@ def report(parser: argparse.ArgumentParser) -> None:
     """
     Make one HTML page of a run: map, errors, residuals by source, what is doubted and why.
 
-    RUN is the folder of a replay or a demo, its run.json, or a bag or g2o file, which is replayed
-    first with the options of `replay`. The page needs no network and no other file.
+    RUN is the folder of a replay or a demo, its run.json, or a bag, which is replayed first with
+    the options of `replay`. Of two runs it shows what changed from the first to the second, and
+    where. A g2o file is solved first, as by `solve`; for a drive through it, replay it, and make
+    the report of that. The page needs no network and no other file.
 
     examples:
       pose-graph report replay                       # of a replay's folder: replay/report.html
       pose-graph report demo -o tuesday.html --open
       pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
+      pose-graph report monday tuesday -o changes.html
+      pose-graph report graph.g2o --robust
       pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
     """
     parser.add_argument('runs', metavar='RUN', type=Path, nargs='+', help='folder of a replay or '
-                        'a demo, run.json, bags, or a .g2o or .graph file')
+                        'a demo, or its run.json; or two of them; or bags; or a .g2o or .graph '
+                        'file')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path,
                         help='the page (default: report.html in the folder of the run)')
     parser.add_argument('--run', metavar='DIR', type=Path, default=Path('report'), dest='folder',
-                        help='of a bag: folder for the results of the replay '
+                        help='of a bag, a graph or two runs: folder for the results '
                         '(default: %(default)s)')
+    parser.add_argument('--robust', nargs='?', choices=METHODS, const=METHODS[0],
+                        help='of a graph: decide which loop closures to believe, as solve does')
     parser.add_argument('--json', action='store_true',
                         help='print what was found as JSON instead of a text')
     parser.add_argument('--open', action='store_true', help='show the page in a browser')
@@ -198,7 +205,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
       pose-graph solve graph.graph --edge2 toro --start best
       pose-graph solve graph.g2o --marginals newest
       pose-graph solve graph.g2o --marginals all -o covariances.csv --json
-      pose-graph solve graph.g2o --robust -o optimised.g2o
+      pose-graph solve graph.g2o --robust -o optimised.g2o --picture graph.png
       pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
 
     exit code: 0 converged, 1 not converged, 2 wrong input
@@ -217,6 +224,8 @@ def solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--marginals', metavar='{all,newest,IDS}',
                         help='covariances of these nodes, such as 3,7,20:25, as CSV: the last '
                              'output, or -o FILE.csv (default, with such a file: all)')
+    parser.add_argument('--picture', metavar='FILE', type=_picture, help='.svg or .png file of '
+                        'the graph before and after, its loop closures by their error')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools/solve.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, '

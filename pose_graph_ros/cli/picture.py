@@ -3,15 +3,19 @@
 """
 Draw a drive: a map of all paths, and below it (or beside a tall one) their errors over time.
 
-A simulated one has the truth in place of a corrected path.
+A simulated one has the truth in place of a corrected path. A graph is drawn before and after its
+optimisation.
 """
 
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
@@ -19,7 +23,10 @@ import numpy as np
 
 from pose_graph_ros.cli import drive as drives
 from pose_graph_ros.cli.drive import distances, Drive, extent
+from pose_graph_ros.cli.solved import SolvedGraph
 from pose_graph_ros.core.geometry import geodesy, trajectory
+from pose_graph_ros.core.geometry.se2 import BoolArray, Poses
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
@@ -46,6 +53,9 @@ STYLE: Any = {
     'legend.frameon': False, 'svg.fonttype': 'none',
     # the renderer keeps all pixels that a piece of a line touches, each time it does
     'agg.path.chunksize': 1000}
+ERRORS = ListedColormap(colormaps['YlOrRd'](np.linspace(0.3, 1.0, 256)))
+LEAST_ERROR = 0.1  # that has the darkest colour [sigma]
+MOST_LINES = 5000  # of each kind that an SVG picture has as lines, not as pixels
 
 
 SIMULATED = {'doubted fixes, not used': 'fixes moved by a jump',
@@ -245,3 +255,60 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
                                for false in (wrong, group >= 0))
     draw_drive(Drive(odometry, nothing, truth, stamps, measured, fix_states, [''] * len(
         stamps), ends, loop_states, [''] * len(ends)), file, title, SIMULATED)
+
+
+def draw_solved(solved: SolvedGraph, file: Path, title: str) -> None:
+    """Draw a graph before and after its optimisation, closures coloured by their error after."""
+    wide, tall = np.maximum(np.ptp(solved.after[:, :2], axis=0), 1e-9).tolist()
+    used = solved.off[solved.is_closure & ~solved.is_doubted]
+    # a few that are far off would make all others look alike
+    most = max([LEAST_ERROR, *(np.percentile(used, [99.0]) if len(used) > 0 else ())])
+    shades = ScalarMappable(Normalize(0.0, most), ERRORS)
+    beside = tall > 0.6 * wide
+    with rc_context(STYLE):
+        size = (16.0, 9.0) if beside else (16.0, float(np.clip(30.0 * tall / wide + 3.0, 8.0, 20)))
+        figure = Figure(figsize=size, dpi=100, layout='constrained')
+        plans = figure.subplots(*((1, 2) if beside else (2, 1)))
+        for plan, poses, name, chi2 in (
+                (plans[0], solved.before, 'as read', solved.chi2_before),
+                (plans[1], solved.after, 'optimised', solved.result.chi2)):
+            _draw_graph(plan, solved, poses, shades)
+            plan.set_title(f'{name}: chi2 {chi2:.6g}', loc='left', fontsize=13, fontweight='bold')
+        handles, labels = plans[1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc='outside lower left', ncols=5)
+        if len(used) > 0:
+            figure.colorbar(shades, ax=plans, shrink=0.7, aspect=40, extend='max').set_label(
+                'error of a constraint after the optimisation [sigma]')
+        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold', parse_math=False)
+        figure.savefig(file)
+
+
+def _draw_graph(axes: Axes, solved: SolvedGraph, poses: Poses, shades: ScalarMappable) -> None:
+    """Draw all constraints of a graph at some poses, the worst on top."""
+    factors, off, used = solved.factors, solved.off, ~solved.is_doubted
+    to_landmarks = solved.is_closure & ~solved.is_pose[factors.j]
+    looks: tuple[tuple[str, BoolArray, dict[str, Any]], ...] = (
+        ('odometry', solved.is_odometry, {'colors': BLUE, 'linewidths': 1.0, 'zorder': 2}),
+        ('doubted loop closures, not used', solved.is_doubted, {
+            'colors': GREY, 'linewidths': 0.9, 'linestyles': '--', 'zorder': 1, 'alpha': 0.8}),
+        ('sightings of landmarks', to_landmarks & used, {'linewidths': 0.7, 'zorder': 3}),
+        ('loop closures', solved.is_closure & ~to_landmarks & used,
+         {'linewidths': 1.3, 'zorder': 4}))
+    for name, chosen, look in looks:
+        rows = np.flatnonzero(chosen)
+        rows = rows[np.argsort(off[rows], kind='stable')]
+        if len(rows) > 0:
+            axes.add_collection(LineCollection(
+                [*poses[np.column_stack((factors.i[rows], factors.j[rows])), :2]], label=name,
+                rasterized=len(rows) > MOST_LINES,
+                **{'colors': shades.to_rgba(off[rows]), **look}))
+    measured = factors.mean[np.isin(
+        factors.kind, (FactorKind.GLOBAL_POSE, FactorKind.POSITION)), :2]
+    for name, places, marker in (('landmarks', poses[~solved.is_pose, :2], 's'),
+                                 ('measured positions', measured, 'o')):
+        if len(places) > 0:
+            axes.plot(*thinned(places).T, marker, color=ORANGE, markersize=3, label=name,
+                      markeredgewidth=0, zorder=5)
+    axes.autoscale_view()
+    axes.set_aspect('equal', adjustable='datalim')
+    axes.set(xlabel='x [m]', ylabel='y [m]')

@@ -23,6 +23,7 @@ import numpy as np
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
+from pose_graph_ros.cli.solved import solved_graph
 from pose_graph_ros.core import config, sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
@@ -254,8 +255,10 @@ def execute(options: argparse.Namespace) -> int:
         options.graph, options.robust = Path(options.robust), METHODS[0]
     if options.graph is None:
         raise ConfigError('expected the file of a graph')
-    for path in (each for each in options.out if not each.parent.is_dir()):
-        raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
+    for option, path in (*(('--out', each) for each in options.out),
+                         *([] if options.picture is None else [('--picture', options.picture)])):
+        if not path.parent.is_dir():
+            raise ConfigError(f'{option}: there is no folder {path.parent} for {path.name}')
     return _solve(options, (lambda _: None) if options.json else print)
 
 
@@ -279,20 +282,8 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         names = ', '.join(map(str, file.ids[held[:N_LARGEST]].tolist()))
         say(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
             f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
-    begin, start = time.monotonic(), options.start
-    doubted, decision, certificate, proof = np.empty(0, np.int64), None, None, list[str]()
-    if options.robust is not None:
-        from pose_graph_ros.cli.believe import doubt
-
-        doubted, decision, lines = doubt(problem, options.robust, options.closure_sigma)
-        for line in lines:
-            say(line)
-        start = start if decision['truncated_cost'] is None else 'present'
-    solution = solve(problem, start)
-    seconds = time.monotonic() - begin
-    if options.certificate:
-        solution, (certificate, proof) = with_certificate(
-            problem, solution, eigenvalue=options.json)
+    poses = graph.poses.copy()
+    solution, doubted, decision, certificate, proof, seconds = optimised(problem, options, say)
     say('\n'.join([*_lines(problem, solution, seconds, doubted), *proof]))
     table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
     text = '\n'.join([','.join(COLUMNS), *(','.join(
@@ -302,6 +293,12 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             path.write_text(text, encoding='ascii')
         else:
             write_g2o(problem.graph, path, problem.ids)
+    if options.picture is not None:
+        # matplotlib takes half a second to load
+        from pose_graph_ros.cli.picture import draw_solved
+
+        draw_solved(solved_graph(problem, poses, before, solution.result, doubted),
+                    options.picture, options.graph.name)
     if options.json:
         graph, result = problem.graph, solution.result
         edges = graph.factors_at(doubted)
@@ -322,6 +319,37 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     elif rows is not None and len(tables) == 0:
         print(text, end='')
     return 0 if solution.result.status is Status.CONVERGED else 1
+
+
+class Optimised(NamedTuple):
+    """What was found of a graph."""
+
+    solution: Solution
+    doubted: IntArray  # rows of closures
+    decision: dict[str, Any] | None  # `robust` in the JSON output
+    certificate: dict[str, Any] | None  # and this and the next as in `Report`
+    proof: list[str]
+    seconds: float  # without the certificate
+
+
+def optimised(problem: Problem, options: argparse.Namespace,
+              say: Callable[[str], None]) -> Optimised:
+    """Solve a graph in place by `robust`, `closure_sigma`, `start`, `certificate` and `json`."""
+    begin, start = time.monotonic(), options.start
+    doubted, decision, certificate, proof = np.empty(0, np.int64), None, None, list[str]()
+    if options.robust is not None:
+        from pose_graph_ros.cli.believe import doubt
+
+        doubted, decision, lines = doubt(problem, options.robust, options.closure_sigma)
+        for line in lines:
+            say(line)
+        start = start if decision['truncated_cost'] is None else 'present'
+    solution = solve(problem, start)
+    seconds = time.monotonic() - begin
+    if options.certificate:
+        solution, (certificate, proof) = with_certificate(
+            problem, solution, eigenvalue=options.json)
+    return Optimised(solution, doubted, decision, certificate, proof, seconds)
 
 
 def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArray) -> list[str]:

@@ -43,6 +43,7 @@ Where next to nothing is left, as of odometry that alone determines the poses, n
 nothing is said.
 """
 
+from collections.abc import Callable, Mapping
 import math
 from typing import Any, NamedTuple
 
@@ -52,7 +53,7 @@ from scipy.special import chdtri
 from pose_graph_ros.core.disagreement import edges_by_source
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.quantities import StampsNs
@@ -133,16 +134,11 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
     for source, (stamps, ids) in factors.held().items():
         residuals = _residuals(graph, (source, 'map'), ids, stamps, scales)
         table = graph.factors_at(ids)
-        # J P J^T of measurements of points of the robot, in map axes
-        rows = graph.node_rows(table.i)
-        arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
-        J = np.tile(np.eye(3), (len(rows), 1, 1))
-        J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
         errors = factors.errors_in_use(source)
         # the variance of correlated errors, in units of the claimed one
         total = 1.0 if errors is None else errors.correlated + errors.white
-        found[source] = residuals._replace(taken=J @ covariances[rows] @ np.swapaxes(
-            J, 1, 2), scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
+        found[source] = residuals._replace(taken=_taken(graph, covariances, table), scale=np.where(
+            table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
     for name, ids in edges_by_source(parts).items():
         if name[0] not in found:
             edges = graph.factors_at(ids)
@@ -155,6 +151,38 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
             found[name[0]] = residuals
     return {source: each.rows(np.argsort(each.stamps_ns, kind='stable'))
             for source, each in found.items() if len(each.ids) > 0}
+
+
+def of_solved(graph: Graph, covariances: Covariances, taken: Callable[[Factors], Covariances],
+              groups: Mapping[tuple[str, str], IntArray], stamps_ns: StampsNs,
+              ) -> dict[str, SourceResiduals]:
+    """
+    Return the residuals of rows of factors, given by source and kind, of a graph without sources.
+
+    `taken` tells J P J^T of edges; covariances are those of nodes, stamps those of all factors.
+    """
+    scales = np.where(graph.weights > 0.0, graph.weights, 1.0)**-0.5
+    found: dict[str, SourceResiduals] = {}
+    for name, every in groups.items():
+        rows = every[np.argsort(stamps_ns[every], kind='stable')]
+        residuals = _residuals(graph, name, graph.factor_ids[rows], stamps_ns[rows], scales)
+        table = graph.factors_at(residuals.ids)
+        if name[1] == 'map':
+            residuals = residuals._replace(taken=_taken(graph, covariances, table))
+        else:
+            some = spread(len(rows), 1000)
+            residuals.taken[some] = taken(table.rows(some))
+        found[name[0]] = residuals
+    return found
+
+
+def _taken(graph: Graph, covariances: Covariances, table: Factors) -> Covariances:
+    """Return J P J^T of measurements of points of the robot, in map axes."""
+    rows = graph.node_rows(table.i)
+    arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
+    J = np.tile(np.eye(3), (len(rows), 1, 1))
+    J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
+    return np.asarray(J @ covariances[rows] @ np.swapaxes(J, 1, 2))
 
 
 def _residuals(graph: Graph, name: tuple[str, str], ids: IntArray, stamps_ns: StampsNs,

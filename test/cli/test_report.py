@@ -142,7 +142,7 @@ def test_folders_that_are_no_runs_and_wrong_options_are_named(
             ([tmp_path / 'empty'], 'expected the folder of a replay or a demo with run.json'),
             ([tmp_path / 'words.txt'], 'expected run.json, or a file with the suffix .mcap'),
             ([tmp_path / 'missing'], 'missing: does not exist'),
-            ([folder, folder], 'expected one run, or several bags'),
+            ([folder, bag], 'expected one run, two runs to compare, or bags'),
             ([folder, '--odom', '/odom'], '--odom: '), ([folder, '--from', 3], '--from: '),
             ([folder, '-o', 'page.png'], '--out page.png: the name must end in .html'),
             ([bag, '--run', bag], 'this is a bag; name another folder'),

@@ -14,6 +14,7 @@ import subprocess
 import time
 from typing import Any
 
+from false_loops import laps
 import numpy as np
 import pytest
 from report_data import example
@@ -21,7 +22,10 @@ from report_data import example
 import pose_graph_ros
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.report import render
+from pose_graph_ros.cli.run.comparison import compared
+from pose_graph_ros.cli.run.graph_document import solved_document
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.io.g2o import write_g2o
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
 WIDE, NARROW = 1400, 400
@@ -118,16 +122,36 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope='module')
-def real(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Data of a simulated drive with false loop closures, as replay writes them."""
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return runs of a drive with false loop closures: `run`, and `all` that uses them."""
     folder = tmp_path_factory.mktemp('drive')
-    bag, run = str(folder / 'bag'), folder / 'run'
-    assert main(['simulate', bag, '--world', 'grid', '--duration', '200', '--fix-period', '4',
-                 '--false-rate', '0.15']) == 0
-    assert main(['replay', bag, '-o', str(run), '--odom', '/odom', '--truth', '/ground_truth',
-                 '--hold-out', '5']) == 0
-    found: dict[str, Any] = json.loads((run / 'run.json').read_text(encoding='utf-8'))
+    assert main(['simulate', str(folder / 'bag'), '--world', 'grid', '--duration', '200',
+                 '--fix-period', '4', '--false-rate', '0.15']) == 0
+    for name, *words in (('run',), ('all', '-p', 'loop_closure.robust:=none')):
+        assert main(['replay', str(folder / 'bag'), '-o', str(folder / name), '--odom', '/odom',
+                     '--truth', '/ground_truth', '--hold-out', '5', *words]) == 0
+    return folder
+
+
+@pytest.fixture(scope='module')
+def real(runs: Path) -> dict[str, Any]:
+    """Data of a drive as replay writes them."""
+    found: dict[str, Any] = json.loads((runs / 'run' / 'run.json').read_text(encoding='utf-8'))
     return found
+
+
+@pytest.fixture(scope='module')
+def two(runs: Path) -> dict[str, Any]:
+    """Data of two runs, of which the second believes all closures."""
+    return compared((runs / 'run' / 'run.json', runs / 'all' / 'run.json'))
+
+
+@pytest.fixture(scope='module')
+def graph(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Data of a solved graph with wrong closures."""
+    file = tmp_path_factory.mktemp('graph') / 'laps.g2o'
+    write_g2o(laps(4, n_wrong=3).graph, file)
+    return solved_document(file, None, 'selection')
 
 
 @pytest.fixture(scope='module')
@@ -413,6 +437,139 @@ def test_an_hour_of_driving_is_below_5_mb_and_can_be_panned(show) -> None:
     assert time.process_time() - began < 5.0
 
 
+def slide(opened: Opened, slider: str, value: float) -> None:
+    opened.page.evaluate('''([id, value]) => {
+      const slider = document.getElementById(id);
+      slider.value = value;
+      slider.dispatchEvent(new Event('input'));
+    }''', [slider, value])
+
+
+def test_what_is_outside_of_the_window_of_time_is_not_on_the_map(show, real) -> None:
+    opened, table = show(real), real['closures'][0]
+    closure, whole = doubted(real), opened.painted()
+    at = table['id'].index(closure.name)
+    slide(opened, 'to', table['t0'][at] - 5.0)
+    assert opened.page.inner_text('#span') != 'Map: the whole path'
+    part = opened.painted()
+    assert part != whole
+    opened.page.locator('#stage').scroll_into_view_if_needed()
+    opened.page.mouse.click(*opened.place(*closure.place))
+    assert closure.name not in opened.panel()
+    # all that is shown fits the map
+    before = opened.view()[2]
+    slide(opened, 'to', 0.15 * real['duration'])
+    opened.page.click('[aria-label="Show all"]')
+    assert opened.view()[2] > 1.2 * before
+    # who asks for something outside gets it
+    opened.page.locator('.entry').filter(
+        has=opened.page.get_by_text(closure.name, exact=True)).first.click()
+    assert opened.page.inner_text('#span') == 'Map: the whole path'
+    assert closure.name in opened.panel()
+
+
+def test_the_path_is_coloured_by_error_by_sigma_or_by_time(show, real) -> None:
+    opened = show(real, color_scheme='dark')
+    select = opened.page.locator('[data-layer=corrected] select')
+    names = select.locator('option').all_inner_texts()
+    assert names == ['in one colour', 'by error', 'by sigma', 'by time']
+    pictures = []
+    for name in names:
+        select.select_option(name)
+        pictures.append(opened.painted())
+        legend = opened.page.inner_text('[data-layer=corrected] .legend').split('\n')
+        # from the least to the largest of them
+        assert legend == ([''] if name == names[0] else sorted(legend, key=lambda text: float(
+            text.split()[0].replace(':', ''))))
+    assert len(set(pictures)) == 4
+    opened.page.click('#scheme')
+    assert opened.painted() not in pictures
+
+
+def test_show_zooms_to_what_a_finding_speaks_of(show, real) -> None:
+    opened = show(real)
+    found = next(each for each in real['findings'] if len(each['at']) > 0)
+    before, whole = opened.view(), opened.painted()
+    opened.page.locator('#findings li', has_text=found['text']).locator('a').click()
+    assert opened.painted() != whole
+    path, (x, y, scale) = real['lines']['corrected'], opened.view()
+    assert scale != before[2]
+    box = opened.page.locator('#stage').bounding_box()
+    for at in itertools.chain(*found['at']):
+        place = [np.interp(at, path['t'], path[name]) for name in 'xy']
+        assert abs(place[0] - x) * scale < box['width'] / 2
+        assert abs(place[1] - y) * scale < box['height'] / 2
+    # one place alone is shown near
+    data = {**real, 'findings': [found | {'at': [[100.0, 100.0]]}]}
+    opened = show(data)
+    opened.page.click('#findings a')
+    assert opened.view()[2] > 2.0 * before[2]
+    assert opened.view()[:2] == pytest.approx(
+        [np.interp(100.0, path['t'], path[name]) for name in 'xy'], abs=0.01)
+
+
+def test_the_scheme_that_was_chosen_is_remembered(show, made) -> None:
+    opened = show(made, color_scheme='light')
+    opened.page.click('#scheme')
+    opened.page.reload()
+    assert opened.page.evaluate('document.documentElement.dataset.scheme') == 'dark'
+    del opened.requests[2:]     # it was asked for twice
+    # where nothing may be kept, the page is as it was before
+    opened = show(made, color_scheme='light')
+    opened.page.add_init_script('''Object.defineProperty(window, 'localStorage', {
+      get() { throw new Error('not allowed'); }})''')
+    opened.page.reload()
+    opened.page.click('#scheme')
+    assert opened.page.evaluate('document.documentElement.dataset.scheme') == 'dark'
+    opened.page.reload()
+    assert opened.page.evaluate('document.documentElement.dataset.scheme') == 'light'
+    del opened.requests[2:]
+
+
+@pytest.mark.parametrize('width', [WIDE, NARROW])
+def test_of_two_runs_it_shows_what_changed_and_where(show, two, width) -> None:
+    opened = show(two, width)
+    page = opened.page
+    assert [page.inner_text(f'nav li:nth-child({k}) a') for k in (1, 2, 3, 4)] == [
+        'Figures', 'Map', 'Differences', 'Places']
+    row = page.locator('#figures tr', has_text='loop_closure.robust')
+    assert row.locator('td').all_inner_texts() == ['judged', 'none', '']
+    # closures that only B believes, with what A says of them
+    entries = page.locator('details[data-kind=closure] .entry')
+    assert entries.count() == len(two['closures'][0]['state']) > 0
+    entries.first.click()
+    assert 'A: Doubted and not used' in opened.panel()
+    assert 'B: believed' in opened.panel()
+    # where the paths differ most
+    spring = two['springs'][0]
+    page.locator('.springs .entry').first.click()
+    assert 'Difference' in opened.panel()
+    assert opened.view()[:2] == pytest.approx(
+        [0.5 * (spring['from'][axis] + spring['to'][axis]) for axis in 'xy'], abs=0.01)
+    shown = opened.painted()
+    page.locator('[data-layer=other] input').click()
+    assert opened.painted() != shown
+    assert page.locator('#errors canvas').count() == 2
+    assert opened.overflow() <= 0
+
+
+@pytest.mark.parametrize('width', [WIDE, NARROW])
+def test_of_a_graph_it_shows_nodes_and_closures_by_their_error(show, graph, width) -> None:
+    opened = show(graph, width)
+    page = opened.page
+    assert 'sigma' in page.inner_text('[data-layer="closure/closures"] .legend')
+    by_error = opened.painted()
+    page.select_option('[data-layer="closure/closures"] select', 'by state')
+    assert opened.painted() != by_error
+    page.locator('details[data-kind=closure] .entry').first.click()
+    assert 'Doubted and not used' in opened.panel()
+    assert 'node' in opened.panel()
+    assert re.match(r'node \d+ · ', page.inner_text('#where'))
+    assert page.locator('#sources article').count() == 2
+    assert page.locator('.springs .entry').count() == 10
+    assert opened.overflow() <= 0
+
+
 # --- colours ------------------------------------------------------------------------------------
 
 def scheme(which: int) -> dict[str, np.ndarray]:
@@ -444,7 +601,7 @@ def test_texts_and_marks_have_enough_contrast(name) -> None:
             ('page', 'surface', 'raised'),
             ('ink', 'muted', 'accent', 'warning', 'notice', 'good')):
         assert contrast(colours[ground], colours[text]) >= 4.5, (ground, text)
-    for mark in MARKS:
+    for mark in (*MARKS, *(f'ramp{k}' for k in range(5))):
         assert contrast(colours['surface'], colours[mark]) >= 3.0, mark
 
 

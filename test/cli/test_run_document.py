@@ -204,14 +204,14 @@ def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
     interrupted = [*tenths[:41], *tenths[80:]]
     arrived = {'wheels': tenths, 'visual': interrupted, 'gyro': interrupted}
     kinds = {'wheels': ODOMETRY, 'visual': ODOMETRY, 'gyro': GYRO}
-    told = {text.partition(':')[0]: text.rpartition('; ')[2]
-            for _, text, _ in silences(arrived, kinds, 0)}
+    told = {each.text.partition(':')[0]: each.text.rpartition('; ')[2]
+            for each in silences(arrived, kinds, 0)}
     assert told == {
         'visual': 'the motion there is that of other odometry, as far as it goes on',
         'gyro': 'the heading there is that of other sources'}
     del kinds['wheels'], arrived['wheels']
-    (_, text, _), _ = silences(arrived, kinds, 0)
-    assert text.endswith('the motion there is not known')
+    visual, _ = silences(arrived, kinds, 0)
+    assert visual.text.endswith('the motion there is not known')
 
 
 @pytest.mark.parametrize('source', ['odom', 'fix'])
@@ -219,6 +219,8 @@ def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source) -> None:
     for length, level in ((7, 'notice'), (25, 'warning')):
         stamps = [tenth * SECOND // 10 for tenth in (
             *range(10, 110), *range(109 + 10 * length, 210 + 10 * length))]
-        (found, text, _), = silences({source: stamps}, {'odom': ODOMETRY, 'fix': FIX}, SECOND)
-        assert found == level
-        assert f'({length} s at most)' in text
+        found, = silences({source: stamps}, {'odom': ODOMETRY, 'fix': FIX}, SECOND)
+        assert found.level == level
+        assert f'({length} s at most)' in found.text
+        # where it is, for the map
+        assert found.at == [(pytest.approx(9.9), pytest.approx(9.9 + length))]

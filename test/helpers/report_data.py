@@ -80,7 +80,7 @@ def example(
                     source(rng, t, 'odom', kind='odometry', count=poses, ratio=0.97),
                     {'name': 'loop_closure', 'kind': 'loop_closure', 'count': closures, 'used': 0,
                      'rows': [], 'energy': None, 'verdict': None, 'histogram': None,
-                     'series': None, 'autocorrelation': None, 'scale': 1.0}],
+                     'series': None, 'autocorrelation': None, 'ratio': None, 'scale': 1.0}],
         'springs': [spring(rank, t, path) for rank in range(1, 11)],
         'updates': {
             't': column(t[told]), 'nodes': (told + 1).tolist(),
@@ -155,7 +155,7 @@ def source(
         'autocorrelation': {
             'lag': column(lag), 'value': column(np.exp(-lag / 17.0) + rng.normal(0, 0.03, 30)),
             'band': 0.06, 'time': 17.0, 'fitted': column(np.exp(-lag / 17.0)), 'in_use': 30.0},
-        'scale': ratio}
+        'ratio': ratio, 'scale': ratio}
 
 
 def spring(rank: int, t: np.ndarray, path: np.ndarray) -> dict[str, Any]:

@@ -23,17 +23,17 @@ class Columns:
         self.columns = columns
 
 
-PATH = Columns(x=NUMBER, y=NUMBER)
+PATH = Columns(t=NUMBER, x=NUMBER, y=NUMBER)
 RATIOS = {'ratio': Maybe(NUMBER), 'low': Maybe(NUMBER), 'high': Maybe(NUMBER)}
 PLACE = {'t': NUMBER, 'x': NUMBER, 'y': NUMBER}
 SCHEMA = {
     'version': COUNT, 'title': TEXT, 'subtitle': TEXT, 'start': Maybe(TEXT), 'start_ns': TEXT,
     'duration': NUMBER, 'axes': [TEXT], 'offset': [NUMBER],
     'facts': [{'label': TEXT, 'value': TEXT, 'note': TEXT}],
-    'findings': [{'level': TEXT, 'text': TEXT, 'anchor': TEXT}],
+    'findings': [{'level': TEXT, 'text': TEXT, 'anchor': TEXT, 'at': [[NUMBER]]}],
     'lines': {'corrected': Columns(t=NUMBER, x=NUMBER, y=NUMBER, theta=NUMBER), 'odometry': PATH,
               'truth': Maybe(PATH)},
-    'ellipses': Columns(x=NUMBER, y=NUMBER, xx=NUMBER, xy=NUMBER, yy=NUMBER),
+    'ellipses': Columns(t=NUMBER, x=NUMBER, y=NUMBER, xx=NUMBER, xy=NUMBER, yy=NUMBER),
     'fixes': [Columns(
         source=None, left_out=None, t=NUMBER, x=NUMBER, y=NUMBER, state=COUNT, why=NUMBER,
         id=TEXT, d=Maybe(NUMBER), at=NUMBER)],
@@ -67,11 +67,14 @@ SCHEMA = {
         't': [NUMBER], 'nodes': [COUNT], 'ms': [NUMBER], 'chi2': [NUMBER], 'count': COUNT,
         'period': NUMBER}),
     'sparsity': [{'title': TEXT, 'size': COUNT, 'nonzeros': COUNT, 'fill': COUNT, 'bins': COUNT,
-                  'cells': [[COUNT]]}]}
+                  'cells': [[COUNT]]}],
+    'parameters': None}
 
 
 def problems(value: Any, kind: Any = SCHEMA, where: str = 'run') -> Iterator[str]:
     """Yield what is not as the schema has it."""
+    if kind is None:
+        return
     if isinstance(kind, Maybe):
         if value is not None:
             yield from problems(value, kind.kind, where)

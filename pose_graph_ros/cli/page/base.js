@@ -60,6 +60,7 @@ let palette = {};
 
 /** The value of a colour of report.css in the scheme that is shown. */
 function colour(name) {
+  if (name.startsWith('#')) return name;
   if (!(name in palette)) {
     const both = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
     palette[name] = both.match(/#\w+/g)[Number(document.documentElement.dataset.scheme === 'dark')];
@@ -72,6 +73,22 @@ function setScheme(name) {
   document.documentElement.dataset.scheme = name;
   palette = {};
   for (const repaint of repaints) repaint();
+}
+
+/** How values become colours: from the least one to that which 98 % are below; null without any. */
+function rampOf(values, text) {
+  const sorted = (values || []).filter(known).sort((one, other) => one - other);
+  const [low, high] = [sorted[0], sorted[Math.floor(0.98 * (sorted.length - 1))]];
+  return sorted.length === 0 ? null : {values, low: text(low), high: text(high), colourOf: (value) => {
+    if (!known(value)) return colour('refused');
+    // in few steps, as each colour is painted at once
+    const at = Math.round(32 * Math.min(1, Math.max(0, (value - low) / (high - low || 1)))) / 8;
+    const k = Math.min(3, Math.floor(at));
+    const [one, other] = [k, k + 1].map((step) => colour(`ramp${step}`).match(/\w\w/g).map(
+      (part) => parseInt(part, 16)));
+    return `#${one.map((part, c) => Math.round(part + (at - k) * (other[c] - part)).toString(16)
+      .padStart(2, '0')).join('')}`;
+  }};
 }
 
 // --- numbers ------------------------------------------------------------------------------------
@@ -95,6 +112,7 @@ const degrees = (radians) => (known(radians) ? (radians * 180) / Math.PI : null)
 /** Seconds since the start, as `12.3 s` or `2:03.4` or `1:02:03`. */
 function clock(seconds, digits = 1) {
   if (!known(seconds)) return '–';
+  if (DATA.by_node) return `node ${Math.round(seconds + Number(DATA.start_ns) * 1e-9)}`;
   if ((DATA.duration || 0) < 120) return `${seconds.toFixed(digits)} s`;
   const ticks = Math.round(Math.abs(seconds) * 10 ** digits);
   const rest = ((ticks / 10 ** digits) % 60).toFixed(digits);
@@ -104,7 +122,7 @@ function clock(seconds, digits = 1) {
   return `${seconds < 0 ? '-' : ''}${head}:${rest.padStart(digits > 0 ? digits + 3 : 2, '0')}`;
 }
 
-const clockUnit = () => ((DATA.duration || 0) < 120 ? 's'
+const clockUnit = () => (DATA.by_node ? 'node' : (DATA.duration || 0) < 120 ? 's'
   : (DATA.duration < 3600 ? 'min:s' : 'h:min:s'));
 
 /** The time of day of a time since the start, if the stamps are of this epoch. */
@@ -153,7 +171,10 @@ function swatch({colour: name, shape, dash, width, area, open}) {
 
 // --- what the reader looks at -------------------------------------------------------------------
 
-const focus = {time: null, item: null};
+const focus = {time: null, item: null, spans: []};
+// the part of the drive that the map shows [s]
+const shownTime = {from: -Infinity, to: Infinity};
+const isShownTime = (time) => !known(time) || (time >= shownTime.from && time <= shownTime.to);
 const followers = {time: [], item: [], print: []};
 
 /** Let all charts and the map mark a time [s]. */
@@ -166,5 +187,6 @@ function lookAtTime(time) {
 /** Let the map and the panel show a measurement, or none. */
 function lookAtItem(item) {
   focus.item = item;
+  focus.spans = [];
   for (const follow of followers.item) follow(item);
 }

@@ -73,7 +73,7 @@ function scaleOf(name, {log, range, floor}, columns, rules) {
 const TIME_STEPS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 18000, 36000, 86400];
 
 function axisOf({label, time, format}, size, space) {
-  const text = format || (time ? (value) => clock(value, 0) : (value) => number(value));
+  const text = format || (time ? (value) => clock(value, 0).replace('node ', '') : (value) => number(value));
   return {
     label, size, space, labelSize: 18, labelGap: 0, font: '12px system-ui, sans-serif',
     labelFont: '12px system-ui, sans-serif', stroke: () => colour('muted'),

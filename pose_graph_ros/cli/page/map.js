@@ -4,7 +4,7 @@
 // painted on two canvases: the layers, when the map has come to rest, and above them what follows
 // the reader. Measurements and springs are items: what a click finds and the panel shows.
 
-/** Put the map on the page; returns how to choose an item. */
+/** Put the map on the page; returns how to choose an item, and how to zoom to parts of the drive. */
 function showMap() {
   const host = section('map', 'Map');
   const path = DATA.lines.corrected;
@@ -26,7 +26,7 @@ function showMap() {
   const box = boxOf(layers);
   let fitted = null;
   const fit = () => {
-    map.fitBounds(box, {padding: [30, 35], animate: false});
+    map.fitBounds(boxOf(layers), {padding: [30, 35], animate: false});
     fitted = map.getZoom();
   };
   fit();
@@ -68,12 +68,29 @@ function showMap() {
     tick();
     below._update();
     lookAtItem(item);
+    if (!item.times.some(isShownTime)) showSpan(-Infinity, Infinity);
     lookAtTime(item.times[item.times.length - 1]);
     const [x, y] = middleOf(item.ends);
     const apart = Math.max(...item.ends.map((end) => Math.hypot(end[0] - x, end[1] - y)));
-    const half = Math.max(1.4 * apart, Math.min(0.06 * (box.getEast() - box.getWest()), 60), 2);
+    lookNear([x, y], 1.4 * apart);
+  };
+  /** Show a place and what is around it. */
+  const lookNear = ([x, y], radius) => {
+    const half = Math.max(radius, Math.min(0.06 * (box.getEast() - box.getWest()), 60), 2);
     map.fitBounds([[y - half, x - half], [y + half, x + half]], {animate: !CALM.matches});
     stage.scrollIntoView({block: 'nearest'});
+  };
+  /** Mark parts of the drive, each from a time to another, and show them. */
+  const zoomTo = (spans) => {
+    showSpan(-Infinity, Infinity);
+    lookAtItem(null);
+    focus.spans = spans;
+    lookAtTime(spans[0][0]);
+    const places = [path, DATA.lines.other || path].flatMap(
+      (line) => spans.flatMap((part) => alongPath(line, part)));
+    const [[left, right], [low, high]] = [0, 1].map((axis) => extent(places.map((at) => at[axis])));
+    lookNear([(left + right) / 2, (low + high) / 2], 0.6 * Math.max(right - left, high - low));
+    above._update();
   };
   const shown = () => layers.filter((layer) => layer.shown);
   const pick = ({lng, lat}, pixels) => {
@@ -107,6 +124,10 @@ function showMap() {
   followers.time.push(() => above._update());
   followers.item.push(() => above._update());
   showTime(main, path);
+  const showSpan = makeSpan(main, path, () => {
+    below._update();
+    above._update();
+  });
   makePanel(side, choose);
   const tables = [...(DATA.fixes || []), ...(DATA.closures || [])];
   for (const {source, left_out: leftOut} of tables.filter((each) => each.left_out > 0)) {
@@ -115,13 +136,18 @@ function showMap() {
   }
   host.append(make('div', {class: 'lists'}, listRejected('closure', items, choose),
     listRejected('fix', items, choose)));
-  return choose;
+  if (DATA.kind === 'comparison' && items.every(({kind}) => kind === 'spring')) {
+    host.append(nothing('No fix and no closure is used in one of the runs and not in the other.'));
+  }
+  return {choose, zoomTo};
 }
 
 /** The box that shows the path and the truth as a whole. */
 function boxOf(layers) {
-  const lines = layers.filter(({id}) => id === 'corrected' || id === 'truth').map(({line}) => line);
-  return L.latLngBounds(lines.flatMap(({x, y}) => x.map((each, k) => [y[k], each]))).pad(0.03);
+  const lines = layers.filter(({id}) => ['corrected', 'truth', 'other'].includes(id));
+  const places = lines.flatMap(({line: {t, x, y}}) => x.map((each, k) => [y[k], each]).filter(
+    (_, k) => !t || isShownTime(t[k])));
+  return L.latLngBounds(places).pad(0.03);
 }
 
 /** The wheel zooms, unless it has begun to scroll the page before the map came under it. */
@@ -172,15 +198,21 @@ const springItems = (DATA.springs || []).map(springItem);
 /** All layers in the order in which they are painted; those without marks are left out. */
 function makeLayers() {
   const lines = DATA.lines || {};
+  const [ours, before] = {graph: ['optimised poses', 'poses as read, moved to fit'],
+    comparison: ['A']}[DATA.kind] || ['corrected path', 'odometry, aligned'];
   const looks = {
-    odometry: {name: 'odometry, aligned', colour: 'odometry', width: 1.5, dash: [6, 4]},
+    odometry: {name: before, colour: 'odometry', width: 1.5, dash: [6, 4]},
     truth: {name: 'truth', colour: 'truth', width: 1.2, dash: [2, 3]},
-    corrected: {name: 'corrected path', colour: 'path', width: 2.2, dash: []}};
+    corrected: {name: ours, colour: 'path', width: 2.2, dash: []},
+    other: {name: 'B', colour: 'odometry', width: 2, dash: [7, 4]}};
   const ellipses = DATA.ellipses || {x: []};
   const measurements = (kind, sources) => (sources || []).map((source) => {
     const items = source.state.map((_, k) => itemOf(kind, source, k));
     const counts = STATES.map((_, state) => items.filter((item) => item.state === state).length);
-    return {id: `${kind}/${source.source}`, kind, items, counts, count: items.length,
+    const byError = kind === 'closure' && source.state.some((state) => state <= WEAK)
+      && rampOf(source.d.filter((_, k) => source.state[k] <= WEAK), (value) => `${number(value)} sigma`);
+    return {id: `${kind}/${source.source}`, kind, items,
+      ramps: byError ? {'by error': byError} : null, ramp: DATA.by_node ? byError || null : null, counts, count: items.length,
       name: `${kind === 'fix' ? 'fixes' : 'closures'}${sources.length > 1 ? ` ${source.source}` : ''}`,
       states: new Set(STATES.keys()), swatch: {...LOOKS[BELIEVED], dash: kind === 'fix' ? null : []}};
   });
@@ -189,11 +221,40 @@ function makeLayers() {
     {id: 'ellipses', name: 'covariances, 2 sigma', count: ellipses.x.length, ellipses, factor: 1,
       swatch: {colour: 'path', area: 0.25}},
     ...Object.entries(looks).filter(([id]) => lines[id]).map(([id, look]) => ({
-      id, name: look.name, count: lines[id].x.length, swatch: look, line: lines[id], look})),
+      id, name: look.name, count: lines[id].x.length, swatch: look, line: lines[id], look,
+      ramps: id === 'corrected' ? pathRamps() : null})),
     ...measurements('closure', DATA.closures), ...measurements('fix', DATA.fixes),
-    {id: 'springs', kind: 'spring', name: 'springs under most tension', count: springs.length,
+    {id: 'springs', kind: 'spring', name: DATA.kind === 'comparison' ? 'where they differ most' : 'springs under most tension', count: springs.length,
       items: springs, swatch: {colour: 'spring', dash: [], width: 4}, shown: false},
   ].filter((layer) => layer.count > 0).map((layer) => ({shown: true, ...layer}));
+}
+
+/** What the colour of the path can tell. */
+function pathRamps() {
+  const {errors, ellipses, lines: {corrected: {t}}} = DATA;
+  const metres = (value) => `${number(value)} m`;
+  const at = (times, column) => (times ? t.map((time) => valueAt(times, column, time)) : null);
+  const sigma = ellipses && ellipses.xx.map((xx, k) => (known(xx) ? Math.sqrt(xx + ellipses.yy[k]) : null));
+  const found = {
+    [DATA.kind === 'comparison' ? 'by distance to B' : 'by error']: errors && rampOf(
+      at(errors.t, errors.position), metres),
+    'by sigma': ellipses && rampOf(at(ellipses.t, sigma), metres),
+    [DATA.by_node ? 'by node' : 'by time']: rampOf(t, (value) => clock(value))};
+  return Object.fromEntries(Object.entries(found).filter(([, ramp]) => ramp));
+}
+
+/** A value at a time, between those before and after it; null outside. */
+function valueAt(times, column, time) {
+  let [low, high] = [0, times.length - 1];
+  if (!(time >= times[low] && time <= times[high])) return null;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= time) low = middle;
+    else high = middle;
+  }
+  const part = times[high] > times[low] ? (time - times[low]) / (times[high] - times[low]) : 0;
+  return known(column[low]) && known(column[high])
+    ? column[low] + part * (column[high] - column[low]) : null;
 }
 
 const middleOf = (ends) => [0, 1].map(
@@ -204,7 +265,7 @@ function nearestItem(layers, x, y, scale, pixels) {
   let [best, found] = [pixels / scale, null];
   for (const {items, states} of layers) {
     for (const item of items || []) {
-      if (states && !states.has(item.state)) continue;
+      if ((states && !states.has(item.state)) || !item.times.some(isShownTime)) continue;
       // what is not believed is wanted more often, and there is less of it
       const bonus = item.state === BELIEVED || item.state === HELD_OUT ? 0 : 3;
       const apart = toSegment(x, y, item.ends[0], item.ends[item.ends.length - 1]) - bonus / scale;
@@ -253,11 +314,28 @@ function showLayers(host, layers, repaint) {
       repaint();
     }}, [1, 3, 10, 30, 100].map((factor) => make('option', {value: factor},
     factor === 1 ? 'true to scale' : `${factor} times as large`)));
+  const ramps = (layer) => {
+    const legend = make('div', {class: 'legend'});
+    const show = (name) => {
+      const ramp = layer.ramps[name] || null;
+      layer.ramp = ramp;
+      legend.replaceChildren(...(ramp ? [ramp.low, make('span', {class: 'ramp'}), ramp.high] : []));
+    };
+    const names = Object.keys(layer.ramps);
+    const chosen = names.find((name) => layer.ramps[name] === layer.ramp);
+    show(chosen);
+    return [make('select', {'aria-label': `Colour of ${layer.name}`, onchange: (event) => {
+      show(event.target.value);
+      repaint();
+    }}, [layer.kind ? 'by state' : 'in one colour', ...names].map((name) => make('option', {
+      value: name, selected: name === chosen}, name))), legend];
+  };
   host.append(make('details', {class: 'layer-box card', open: true}, make('summary', {}, 'Layers'),
     make('ul', {class: 'layers', 'aria-label': 'Layers of the map'}, [...layers].reverse().map(
       (layer) => make('li', {'data-layer': layer.id}, tick(layer.name, layer.swatch, layer.count,
         () => layer.shown, (on) => { layer.shown = on; }),
-      layer.counts ? statesOf(layer) : null, layer.ellipses ? sizes(layer) : null)))));
+      layer.counts ? statesOf(layer) : null, layer.ellipses ? sizes(layer) : null,
+      layer.ramps ? ramps(layer) : null)))));
   const update = () => updates.forEach((each) => each());
   update();
   return update;
@@ -281,6 +359,29 @@ function showTime(host, path) {
   });
 }
 
+/** Two sliders for the part of the drive that the map shows; returns how to set it. */
+function makeSpan(host, {t}, repaint) {
+  const [first, last] = [t[0], t[t.length - 1]];
+  const text = make('output', {id: 'span'});
+  const slider = (id, label, value) => make('input', {type: 'range', id, min: first, max: last,
+    step: 'any', value, 'aria-label': label, oninput: () => show(Number(from.value), Number(to.value))});
+  const [from, to] = [slider('from', 'Show the map from this time on', first),
+    slider('to', 'Show the map up to this time', last)];
+  const show = (begin, end) => {
+    const [low, high] = begin <= end ? [begin, end] : [end, begin];
+    shownTime.from = low > first ? low : -Infinity;
+    shownTime.to = high < last ? high : Infinity;
+    const isWhole = shownTime.from === -Infinity && shownTime.to === Infinity;
+    if (isWhole) [from.value, to.value] = [first, last];
+    text.textContent = isWhole ? 'Map: the whole path'
+      : `Map: ${clock(Math.max(low, first))} to ${clock(Math.min(high, last))}`;
+    repaint();
+  };
+  host.append(make('div', {class: 'time span'}, text, from, to));
+  show(-Infinity, Infinity);
+  return show;
+}
+
 function placeText([x, y]) {
   const [right, up] = DATA.offset || [0, 0];
   return `${(x + right).toFixed(2)}, ${(y + up).toFixed(2)} m`;
@@ -295,6 +396,13 @@ function poseAt({t, x, y, theta}, time) {
   return {x: between(x), y: between(y), theta: theta ? theta[part < 0.5 ? k : m] : null};
 }
 
+/** Places of the path from a time to another, shape [[x, y], ...]. */
+function alongPath(path, [from, to]) {
+  const [begin, end] = [from, to].map((time) => poseAt(path, time)).map(({x, y}) => [x, y]);
+  const within = path.t.flatMap((time, k) => (time > from && time < to ? [[path.x[k], path.y[k]]] : []));
+  return [begin, ...within, end];
+}
+
 // --- the panel and the lists --------------------------------------------------------------------
 
 const KINDS = {fix: 'Fix', closure: 'Loop closure', spring: 'Spring'};
@@ -305,9 +413,9 @@ function makePanel(host, centreOn) {
   const panel = make('div', {class: 'panel card', id: 'panel', 'aria-live': 'polite'});
   host.append(panel);
   const show = (item) => panel.replaceChildren(...(!item ? [make('p', {class: 'hint'},
-    'Click or tap a fix, a closure or a spring on the map to see what is known of it.')] : [
+    'Click or tap a mark on the map to see what is known of it.')] : [
     make('div', {class: 'panel-head'},
-      make('h3', {}, KINDS[item.kind], ' ', make('span', {class: 'id'}, item.id || item.source)),
+      make('h3', {}, item.spring && item.spring.kind === 'difference' ? 'Difference' : KINDS[item.kind], ' ', make('span', {class: 'id'}, item.id || item.source)),
       make('button', {type: 'button', class: 'plain', 'aria-label': 'Close',
         onclick: () => lookAtItem(null)}, '×')),
     make('p', {}, known(item.state) ? make('span', {class: 'state'},
@@ -334,7 +442,9 @@ function factsOf({source, ends, times, tie, distance, spring}) {
   if (known(distance)) rows.push(['distance', `${number(distance)} sigma`]);
   if (!spring) return rows;
   const {rank, kind, energy, expected, residual, sigma} = spring;
-  rows.push(['rank', `${rank} of ${DATA.springs.length}`], ['kind', kind],
+  rows.push(['rank', `${rank} of ${DATA.springs.length}`]);
+  if (kind === 'difference') return rows;
+  rows.push(['kind', kind],
     ['energy', `${number(energy)}, where ${number(expected)} is expected`]);
   const names = ['position', 'fix', 'global pose'].includes(kind) ? ['x', 'y', 'heading']
     : ['along', 'across', 'heading'];
@@ -351,7 +461,7 @@ function factsOf({source, ends, times, tie, distance, spring}) {
 function listRejected(kind, items, choose) {
   const far = ({distance}) => (known(distance) ? distance : -1);
   const found = items.filter((item) => item.kind === kind
-    && (item.state === DOUBTED || item.state === REFUSED));
+    && (DATA.kind === 'comparison' || item.state === DOUBTED || item.state === REFUSED));
   found.sort((one, other) => one.state - other.state || far(other) - far(one));
   if (!items.some((item) => item.kind === kind)) return null;
   const list = make('ol', {class: 'entries'});
@@ -368,7 +478,8 @@ function listRejected(kind, items, choose) {
   }}, `Show the other ${found.length - MOST_ENTRIES}`);
   return make('details', {class: 'rejected card', 'data-kind': kind,
     open: kind === 'closure' && found.length > 0},
-  make('summary', {}, `Doubted and refused ${kind === 'fix' ? 'fixes' : 'closures'} `,
+  make('summary', {}, `${DATA.kind === 'comparison' ? 'Judged otherwise in B:' : 'Doubted and refused'} ${
+    kind === 'fix' ? 'fixes' : 'closures'} `,
     make('span', {class: 'count'}, found.length)),
   found.length > 0 ? list : nothing('None: all were used.'),
   found.length > MOST_ENTRIES ? more : null);

@@ -41,7 +41,8 @@ function paintLayers(layers, context, frame) {
   const measured = (order) => shown.filter(({counts}) => counts).forEach((layer) => order
     .filter((state) => layer.states.has(state) && layer.counts[state] > 0)
     .forEach((state) => (layer.kind === 'fix' ? paintFixes : paintClosures)(
-      layer.items.filter((item) => item.state === state), state, context, frame)));
+      layer.items.filter((item) => item.state === state && item.times.some(isShownTime)), state,
+      context, frame, layer.ramp)));
   for (const layer of shown) {
     if (layer.ellipses) paintEllipses(layer, context, frame);
     if (layer.line && layer.id !== 'corrected') paintPath(layer, context, frame);
@@ -111,18 +112,28 @@ function circle(u, v, radius) {
 }
 
 /** Paint a path, without the points that do not show and the parts that are out of sight. */
-function paintPath({line: {x, y}, look}, context, frame) {
-  const shape = new Path2D();
-  let [p, q, before] = [Infinity, Infinity, 0];
+function paintPath({line: {t, x, y}, look, ramp}, context, frame) {
+  const shapes = new Map();
+  let [p, q, before, last] = [Infinity, Infinity, 0, null];
   for (let k = 0; k < x.length; k += 1) {
+    if (t && !isShownTime(t[k])) {
+      last = null;
+      continue;
+    }
     const [u, v] = frame.place(x[k], y[k]);
-    if (Math.abs(u - p) + Math.abs(v - q) < 1.5 && k < x.length - 1) continue;
+    if (last && Math.abs(u - p) + Math.abs(v - q) < 1.5 && k < x.length - 1) continue;
     const side = sideOf(frame, u, v);
-    shape[k === 0 || (side & before) !== 0 ? 'moveTo' : 'lineTo'](u, v);
-    [p, q, before] = [u, v, side];
+    const name = ramp ? ramp.colourOf(ramp.values[k]) : look.colour;
+    if (!shapes.has(name)) shapes.set(name, new Path2D());
+    const shape = shapes.get(name);
+    const isCut = last === null || (side & before) !== 0;
+    if (isCut) shape.moveTo(u, v);
+    else if (name !== last) shape.moveTo(p, q);
+    if (!isCut) shape.lineTo(u, v);
+    [p, q, before, last] = [u, v, side, name];
   }
   context.setLineDash(look.dash);
-  paint(context, shape, [look.colour, look.width]);
+  for (const [name, shape] of shapes) paint(context, shape, [name, ramp ? 4 : look.width]);
   context.setLineDash([]);
 }
 
@@ -132,7 +143,7 @@ function paintEllipses({ellipses: e, factor}, context, frame) {
   context.lineWidth = 1;
   const painted = [];
   for (let k = 0; k < e.x.length; k += 1) {
-    if (!known(e.xx[k])) continue;
+    if (!known(e.xx[k]) || (e.t && !isShownTime(e.t[k]))) continue;
     const [u, v] = frame.place(e.x[k], e.y[k]);
     const [mean, half] = [(e.xx[k] + e.yy[k]) / 2, Math.hypot((e.xx[k] - e.yy[k]) / 2, e.xy[k])];
     const [long, short] = [mean + half, mean - half].map(
@@ -175,24 +186,27 @@ function paintFixes(items, state, context, frame) {
   }
 }
 
-function paintClosures(items, state, context, frame) {
+/** Paint closures, those that are used in the colours of their errors if there is a ramp. */
+function paintClosures(items, state, context, frame, ramp) {
   const {colour: name, dash} = lookOf(state);
-  const believed = state === BELIEVED;
-  const lines = items.map(({ends}) => ends.map((end) => frame.place(...end))).filter(
+  const [believed, byError] = [state === BELIEVED, ramp && state <= WEAK];
+  const ordered = byError ? [...items].sort((one, other) => one.distance - other.distance) : items;
+  const lines = ordered.map(({ends, distance}) => Object.assign(ends.map(
+    (end) => frame.place(...end)), {shade: byError ? ramp.colourOf(distance) : name})).filter(
     ([one, other]) => (sideOf(frame, ...one) & sideOf(frame, ...other)) === 0);
   context.setLineDash(dash);
-  context.globalAlpha = believed ? 0.75 : 1;
-  for (const line of lines) paint(context, through(line), [name, believed ? 1.3 : 1.6]);
+  context.globalAlpha = believed && !byError ? 0.75 : 1;
+  for (const line of lines) paint(context, through(line), [line.shade, believed ? 1.3 : 1.6]);
   context.setLineDash([]);
   context.globalAlpha = 1;
-  if (lines.length > (believed || state === REFUSED ? 150 : 600)) return;
+  if (byError || lines.length > (believed || state === REFUSED ? 150 : 600)) return;
   for (const line of lines) stamp(state, context, middleOf(line), believed ? 0.7 : 1.1);
 }
 
 function paintSprings({items}, context, frame) {
   context.textAlign = 'center';
   context.textBaseline = 'middle';
-  for (const {ends, spring} of [...items].reverse()) {
+  for (const {ends, spring} of items.filter(({times}) => times.some(isShownTime)).reverse()) {
     const places = ends.map((end) => frame.place(...end));
     const [u, v] = middleOf(places);
     paint(context, through(places), ['spring', 4]);
@@ -205,6 +219,15 @@ function paintSprings({items}, context, frame) {
 /** What the reader looks at: the chosen item, and the robot at the time; and coordinates. */
 function paintFocus(path, context, frame) {
   paintGrid(context, frame, true);
+  context.lineCap = 'round';
+  context.globalAlpha = 0.35;
+  for (const part of focus.spans) {
+    const places = alongPath(path, part).map((place) => frame.place(...place));
+    if (part[0] === part[1]) paint(context, circle(...places[0], 12), ['ink', 4]);
+    else paint(context, through(places), ['ink', 13]);
+  }
+  context.lineCap = 'butt';
+  context.globalAlpha = 1;
   if (focus.item) paintChosen(focus.item, context, frame);
   if (focus.time === null) return;
   const {x, y, theta} = poseAt(path, focus.time);

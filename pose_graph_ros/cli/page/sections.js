@@ -6,7 +6,7 @@ const LEVELS = {
   warning: ['Warning', 'M8,1.5L15,14H1Z M8,6V10 M8,11.6V12.4'],
   notice: ['Notice', 'M8,2a6,6 0 1,0 0.01,0Z M8,7V11.4 M8,4.6V5.4'],
   good: ['Good', 'M8,2a6,6 0 1,0 0.01,0Z M5,8.2L7.2,10.4L11.2,5.8']};
-const timeAxis = (values) => ({label: `time [${clockUnit()}]`, values, time: true,
+const timeAxis = (values) => ({label: DATA.by_node ? 'node' : `time [${clockUnit()}]`, values, time: true,
   range: [0, DATA.duration || 1]});
 const charts = (host, layout) => host.appendChild(make('div', {class: `charts ${layout}`}));
 
@@ -24,9 +24,14 @@ function showHead() {
   toggle.addEventListener('click', () => {
     dark.removeEventListener('change', follow);
     use(root.dataset.scheme === 'dark' ? 'light' : 'dark');
+    remembered((store) => store.setItem('pose-graph-scheme', root.dataset.scheme));
   });
-  dark.addEventListener('change', follow);
-  follow();
+  const chosen = remembered((store) => store.getItem('pose-graph-scheme'));
+  if (chosen === 'dark' || chosen === 'light') use(chosen);
+  else {
+    dark.addEventListener('change', follow);
+    follow();
+  }
   const when = DATA.start ? `${DATA.start.slice(0, 10)} ${DATA.start.slice(11, 19)} UTC` : null;
   document.getElementById('head').append(
     make('div', {class: 'title'}, make('p', {class: 'subtitle'}, 'pose-graph report'),
@@ -37,22 +42,32 @@ function showHead() {
     ({label, value, note}) => make('div', {class: 'card'}, make('dt', {}, label),
       make('dd', {}, value), make('dd', {class: 'note'}, note || '')))));
   showFindings();
-  const names = {map: 'Map', errors: 'Errors', sources: 'Residuals', springs: 'Springs',
-    updates: 'Updates', sparsity: 'Matrices'};
-  document.getElementById('contents').append(make('ul', {}, Object.entries(names).map(
-    ([id, name]) => make('li', {}, linkTo(id, name)))));
+  document.getElementById('contents').append(make('ul', {}, SHOWN.map(
+    (id) => make('li', {}, linkTo(id, SECTIONS[id][0])))));
+}
+
+/** Ask what the browser keeps for the reader; some keep nothing for files, and raise an error. */
+function remembered(ask) {
+  try {
+    return ask(window.localStorage);
+  } catch {
+    return null;
+  }
 }
 
 /** What a person must know; what is as it should be is folded away, unless there is nothing else. */
 function showFindings() {
   const [good, others] = [true, false].map((which) => (DATA.findings || []).filter(
     ({level}) => (level === 'good') === which));
-  const list = (found) => make('ul', {class: 'findings'}, found.map(({level, text, anchor}) => {
+  const list = (found) => make('ul', {class: 'findings'}, found.map(({level, text, anchor, at}) => {
     const name = level in LEVELS ? level : 'notice';
     return make('li', {'data-level': name},
       draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {d: LEVELS[name][1]})),
       make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[name][0]}: `), text),
-      anchor ? linkTo(anchor, 'Show') : null);
+      at && at.length > 0 ? make('a', {href: '#map', onclick: (event) => {
+        event.preventDefault();
+        onMap.zoomTo(at);
+      }}, 'Show') : anchor ? linkTo(anchor, 'Show') : null);
   }));
   const count = `${counted(good.length, 'thing is as it', 'things are as they')} should be`;
   document.getElementById('main').append(
@@ -66,11 +81,12 @@ function showFindings() {
 /** Position and heading errors over time with what was claimed of them, and the table of errors. */
 function showErrors() {
   const {errors} = DATA;
-  const host = section('errors', 'Errors over time', errors
-    ? `Distance to ${errors.against === 'truth' ? 'the truth' : errors.against}. The band is what `
+  const isOfTwo = DATA.kind === 'comparison';
+  const host = section('errors', isOfTwo ? 'Differences over time' : 'Errors over time', errors
+    ? isOfTwo ? 'How far B is from A, at the poses of A.' : `Distance to ${errors.against === 'truth' ? 'the truth' : errors.against}. The band is what `
       + 'the covariances claim: 95 % of errors should be in it.' : null);
   if (errors) showErrorCharts(charts(host, 'wide'), errors);
-  else host.append(nothing('No errors over time: the run had no truth, and no fixes were held out '
+  else host.append(nothing(isOfTwo ? 'The runs do not overlap in time.' : 'No errors over time: the run had no truth, and no fixes were held out '
     + '(--truth, --hold-out).'));
   const rows = DATA.error_table || [];
   if (rows.length > 0) {
@@ -86,18 +102,19 @@ function showErrorCharts(host, {t, position, odometry, sigma, heading}) {
   const log = top(odometry) > 5 * top(position);
   const floor = log ? Math.max(0.002, top(position) / 300) : 0;
   const claimed = (sigma || []).map((each) => (known(each) ? 2 * each : null));
-  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2},
-    {name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]}];
+  const [name, label] = DATA.kind === 'comparison' ? ['A to B', 'difference'] : ['corrected path', 'error'];
+  const series = [{name, y: position, colour: 'path', width: 2}];
+  if (odometry) series.push({name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]});
   if (sigma) {
     series.push({name: 'claimed, 2 sigma', y: claimed, colour: 'path', width: 0.5},
       {y: claimed.map((each) => (each === null ? null : floor / 2)), colour: 'path', width: 0});
   }
   makeChart(host, {title: 'Position', x: timeAxis(t), series,
     band: sigma ? [series.length - 1, series.length] : null,
-    y: {label: log ? 'error [m], logarithmic' : 'error [m]', log, floor}});
+    y: {label: log ? `${label} [m], logarithmic` : `${label} [m]`, log, floor}});
   if ((heading || []).some(known)) {
-    makeChart(host, {title: 'Heading', x: timeAxis(t), y: {label: 'error [degrees]'},
-      series: [{name: 'corrected path', y: heading.map(degrees), colour: 'path'}]});
+    makeChart(host, {title: 'Heading', x: timeAxis(t), y: {label: `${label} [degrees]`},
+      series: [{name, y: heading.map(degrees), colour: 'path'}]});
   }
 }
 
@@ -142,7 +159,7 @@ function showSource(host, source) {
     series: series.rows.map((y, k) => ({kind: 'dots', y, name: (rows[k] || {name: `component ${k}`}).name,
       colour: ['path', 'odometry', 'held-out'][k % 3]})),
     note: 'Dashed: 2 sigma, where 95 % should be within.'});
-  showAutocorrelation(row, source);
+  if (!DATA.by_node) showAutocorrelation(row, source);
 }
 
 /** Whether the interval of a ratio has 1 in it, or says that sigmas are too small or too large. */
@@ -199,26 +216,42 @@ function showAutocorrelation(host, {autocorrelation}) {
 }
 
 /** The constraints under most tension; a click shows them on the map. */
-function showSprings(choose) {
-  const host = section('springs', 'Springs under most tension',
+function showSprings() {
+  const isOfTwo = DATA.kind === 'comparison';
+  const host = isOfTwo ? section('springs', 'Where the paths differ most') : section('springs', 'Springs under most tension',
     'Constraints as springs between poses: the energy is what each adds to chi2, and the mark in '
     + 'its bar is what it adds on average if its covariance is right.');
   if (springItems.length === 0) {
-    return host.append(nothing('None: the graph has no constraints with a residual.'));
+    return host.append(nothing(isOfTwo ? 'Nowhere by more than 2 cm.' : 'None: the graph has no constraints with a residual.'));
   }
   const [, most] = extent(...springItems.map(({spring}) => [spring.energy, spring.expected, 1e-9]));
   return host.append(make('ol', {class: 'springs card'}, springItems.map((item) => {
     const {rank, name, kind, energy, expected, text} = item.spring;
     const bar = (height, x, width, fillName) => draw('rect', {
       x: `${(100 * x) / most}%`, width, height, y: (10 - height) / 2, fill: `var(--${fillName})`});
-    return entry(item, choose, [
-      make('span', {class: 'rank'}, rank), make('span', {class: 'entry-name'}, name),
-      make('span', {class: 'kind'}, kind),
+    return entry(item, onMap.choose, [
+      make('span', {class: 'rank'}, rank),
+      make('span', {class: 'entry-name'}, isOfTwo ? `at ${clock(item.times[0])}` : name),
+      make('span', {class: 'kind'}, isOfTwo ? '' : kind),
       draw('svg', {class: 'bar', 'aria-hidden': 'true'}, bar(8, 0, '100%', 'line'),
-        bar(8, 0, `${(100 * (energy || 0)) / most}%`, 'spring'), bar(10, expected || 0, 2, 'ink')),
-      make('span', {class: 'energy'}, make('b', {}, number(energy)), ` / ${number(expected)}`),
+        bar(8, 0, `${(100 * (energy || 0)) / most}%`, 'spring'), isOfTwo ? null : bar(10, expected || 0, 2, 'ink')),
+      make('span', {class: 'energy'}, make('b', {}, number(energy)), isOfTwo ? ' m' : ` / ${number(expected)}`),
       make('span', {class: 'entry-why'}, (text || '').replace(name, '').replace(/^[:,]? /, ''))]);
   })));
+}
+
+/** What both of two runs tell, beside each other. */
+function showFigures() {
+  const host = section('figures', 'Figures');
+  const listed = (rows) => table('errors figures', ['', 'A', 'B', 'change'], rows);
+  for (const {title, rows} of DATA.figures) {
+    const [same, others] = [true, false].map((which) => rows.filter(
+      ([, one, other]) => (one === other) === which));
+    host.append(make('article', {class: 'card source'}, make('h3', {}, title),
+      others.length > 0 ? listed(others) : nothing('Nothing changed.'),
+      same.length > 0 ? make('details', {}, make('summary', {}, `${same.length} the same in both`),
+        listed(same)) : null));
+  }
 }
 
 /** How long updates took, chi2 and the size of the graph over the drive. */
@@ -286,12 +319,17 @@ const print = (begins) => {
 window.addEventListener('beforeprint', () => print(true));
 window.addEventListener('afterprint', () => print(false));
 
+let onMap = null;
+const SECTIONS = {
+  map: ['Map', () => { onMap = showMap(); }], figures: ['Figures', showFigures],
+  errors: [DATA.kind === 'comparison' ? 'Differences' : 'Errors', showErrors],
+  sources: ['Residuals', showSources],
+  springs: [DATA.kind === 'comparison' ? 'Places' : 'Springs', showSprings],
+  updates: ['Updates', showUpdates], sparsity: ['Matrices', showSparsity]};
+const SHOWN = {graph: ['map', 'sources', 'springs', 'sparsity'],
+  comparison: ['figures', 'map', 'errors', 'springs']}[DATA.kind]
+  || ['map', 'errors', 'sources', 'springs', 'updates', 'sparsity'];
 showHead();
-const choose = showMap();
-showErrors();
-showSources();
-showSprings(choose);
-showUpdates();
-showSparsity();
+SHOWN.forEach((id) => SECTIONS[id][1]());
 document.getElementById('foot').append(make('p', {},
   'Made by pose-graph report. This file holds all its data, and loads nothing.'));

@@ -11,11 +11,12 @@ from dataclasses import asdict
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.cli import drive as drives
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.cli import drive as drives, finite
 from pose_graph_ros.cli.drive import BELIEVED, distances, Drive, extent, HELD_OUT, REFUSED
 from pose_graph_ros.cli.run import Frame, number, rounded, Run, thinned
 from pose_graph_ros.cli.run.findings import findings
@@ -25,10 +26,11 @@ from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.path_files import write_tum
 from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
-from pose_graph_ros.core.judgement.verdicts import Judged, Verdict
+from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.offline import pattern as patterns
 from pose_graph_ros.offline.source_residuals import spread
@@ -40,6 +42,14 @@ VERSION, FILE = 1, 'run.json'
 KEYS = ('title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'facts',
         'findings', 'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table',
         'sources', 'springs', 'updates', 'sparsity', 'texts')
+
+
+class Told(NamedTuple):
+    """What is told of a measurement."""
+
+    id: str
+    distance: float  # when it was judged [sigma]
+    why: str  # it is believed or not
 
 
 def read_document(path: Path) -> dict[str, Any]:
@@ -68,13 +78,14 @@ def document(run: Run) -> dict[str, Any]:
     """Return the JSON object of a run."""
     drive, path = run.drive, run.drive.corrected
     frame = Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
-    verdicts = {(each.source, each.stamp_ns, each.reference_ns): each for each in run.verdicts}
+    verdicts = {(each.source, each.stamp_ns, each.reference_ns): Told(
+        each.id, each.distance, sentence(each, frame.start_ns)
+        if each.kind is not Judged.FIX or texts.is_notable(each) else '')
+        for each in run.verdicts}
     errors = _errors(drive, run.covariances, frame)
     analyses = analyse(run)
-    lines, at_ns = _lines(drive, frame)
+    paths, at_ns = lines(drive, frame)
     start, updates = np.datetime64(run.start_ns, 'ns'), None
-    whole, factor = (of(run.backend.graph) for of in (patterns.hessian, patterns.factor))
-    upper = (whole.nonzeros + whole.size) // 2
     if len(run.recorder.updates) > 0:
         stamps, nodes, milliseconds, chi2 = zip(*thinned(run.recorder.updates), strict=True)
         updates = {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
@@ -88,21 +99,35 @@ def document(run: Run) -> dict[str, Any]:
         'start_ns': str(run.start_ns),
         'duration': round(extent(path)[0], 3),
         'axes': list(drive.map_axes), 'offset': rounded(frame.offset),
-        'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': lines,
-        'ellipses': _ellipses(path, run.covariances, frame),
-        'fixes': _fixes(drive, verdicts, at_ns, frame),
-        'closures': _closures(drive, verdicts, run.recorder.refused, frame),
+        'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': paths,
+        'ellipses': ellipses(path, run.covariances, frame),
+        'fixes': fixes(drive, verdicts, at_ns, frame),
+        'closures': closures(drive, verdicts, run.recorder.refused, frame),
         'states': list(drives.STATES), 'errors': errors,
         'error_table': [asdict(row) | {name: number(getattr(row, name), 5) for name in (
             'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run, analyses, frame),
-        'updates': updates, 'sparsity': [
-            {'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': max(fill, 0),
+        'updates': updates, 'sparsity': patterns_of(run.backend.graph),
+        'texts': list(frame.texts), 'parameters': _set_parameters(run.values)}
+
+
+def _set_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that are not as by default."""
+    usual = checked({name: value for name, value in values.items()
+                     if name == 'sources' or name.endswith('.type')})
+    return finite({name: value for name, value in values.items()
+                   if name == 'sources' or value != usual[name]})
+
+
+def patterns_of(graph: Graph) -> list[dict[str, Any]]:
+    """Return where H and its factor have blocks that are not zero."""
+    whole, factor = patterns.hessian(graph), patterns.factor(graph)
+    fill = max(factor.nonzeros - (whole.nonzeros + whole.size) // 2, 0)
+    return [{'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': fill,
              'bins': each.bins, 'cells': each.cells.tolist()} for title, each, fill in (
                  ('H, poses in the order of time, then biases', whole, 0),
-                 ('R, in the order of elimination', factor, factor.nonzeros - upper))],
-        'texts': list(frame.texts)}
+                 ('R, in the order of elimination', factor, fill))]
 
 
 def _facts(run: Run) -> list[dict[str, str]]:
@@ -209,25 +234,25 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
 
 # --- the map
 
-def _lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
+def lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
     """Return the paths, and the stamps of the poses of the corrected one [ns]."""
-    def places(path: Trajectory | None) -> dict[str, Any] | None:
-        return None if path is None else dict(zip('xy', frame.places(
-            path.poses[spread(len(path), MOST_POSES), :2]), strict=True))
+    def places(path: Trajectory) -> dict[str, Any]:
+        some = spread(len(path), MOST_POSES)
+        x, y = frame.places(path.poses[some, :2])
+        return {'t': frame.seconds(path.stamps_ns[some]), 'x': x, 'y': y}
 
-    path = drive.corrected
+    path, truth = drive.corrected, drive.truth
     some = spread(len(path), MOST_POSES)
-    corrected = {'t': frame.seconds(path.stamps_ns[some]), **(places(path) or {}),
-                 'theta': rounded(path.poses[some, 2])}
+    corrected = {**places(path), 'theta': rounded(path.poses[some, 2])}
     return {'corrected': corrected, 'odometry': places(drive.placed_odometry),
-            'truth': places(drive.truth)}, path.stamps_ns[some]
+            'truth': None if truth is None else places(truth)}, path.stamps_ns[some]
 
 
-def _ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[str, Any]:
+def ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[str, Any]:
     """Return some 200 covariances of positions along a path, in map axes; NaN where unknown."""
     known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
     if len(known) == 0:
-        return {name: [] for name in ('x', 'y', 'xx', 'xy', 'yy')}
+        return {name: [] for name in ('t', 'x', 'y', 'xx', 'xy', 'yy')}
     # evenly along the path and in time, so that stops and fast stretches both have some
     steps = np.hypot(*np.diff(path.poses[known, :2], axis=0).T)
     travelled = np.concatenate(([0.0], np.cumsum(steps)))
@@ -236,7 +261,7 @@ def _ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[
     at = np.unique(np.searchsorted(measure, np.linspace(0.0, measure[-1], 200)))
     some = known[np.clip(at, 0, len(known) - 1)]
     x, y = frame.places(path.poses[some, :2])
-    return {'x': x, 'y': y,
+    return {'t': frame.seconds(path.stamps_ns[some]), 'x': x, 'y': y,
             **{name: [number(value) for value in covariances[some, row, column].tolist()]
                for name, row, column in (('xx', 0, 0), ('xy', 0, 1), ('yy', 1, 1))}}
 
@@ -248,7 +273,7 @@ def _by_source(sources: Sequence[str], stamps: IntArray) -> Iterator[tuple[str, 
         yield source, rows[np.argsort(stamps[rows], kind='stable')]
 
 
-def _judged(keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdict],
+def _judged(keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Told],
             reasons: Mapping[Key, str], frame: Frame) -> dict[str, Any]:
     """Return the columns of what is believed, and why not."""
     found, whys = [verdicts.get(key) for key in keys], []
@@ -256,19 +281,19 @@ def _judged(keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdic
         # of fixes nearly all are believed, for the same reason
         silent = state == HELD_OUT or (state == BELIEVED and key[2] is None)
         whys.append(reasons.get(key, REFUSED_SOMEHOW) if state == REFUSED
-                    else '' if silent or each is None else sentence(each, frame.start_ns))
+                    else '' if silent or each is None else each.why)
     return {'state': states.tolist(), 'why': [frame.text(why) for why in whys],
             'id': ['' if each is None else each.id for each in found],
             # when they were judged [sigma]
             'd': rounded([np.nan if each is None else each.distance for each in found], 2)}
 
 
-def _fixes(drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray,
+def fixes(drive: Drive, verdicts: Mapping[Key, Told], at_ns: IntArray,
            frame: Frame) -> list[dict[str, Any]]:
     """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
     found = []
     for source, every in _by_source(drive.fix_sources, drive.fix_stamps_ns):
-        rows = every[_shown(drive.fix_states[every])]
+        rows = every[shown(drive.fix_states[every])]
         stamps = drive.fix_stamps_ns[rows]
         x, y = frame.places(drive.fix_positions[rows])
         # the nearest pose of the path, -1 outside of it
@@ -284,12 +309,12 @@ def _fixes(drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray,
     return found
 
 
-def _closures(drive: Drive, verdicts: Mapping[Key, Verdict], reasons: Mapping[Key, str],
+def closures(drive: Drive, verdicts: Mapping[Key, Told], reasons: Mapping[Key, str],
               frame: Frame) -> list[dict[str, Any]]:
     """Return the loop closures of each source, in the order of their later ends."""
     path, found = drive.corrected, []
     for source, every in _by_source(drive.loop_sources, drive.loop_stamps_ns[:, 1]):
-        rows = every[_shown(drive.loop_states[every])]
+        rows = every[shown(drive.loop_states[every])]
         stamps = drive.loop_stamps_ns[rows]
         ends = np.sort(stamps, axis=1)
         places = path.at(np.clip(ends, *path.stamps_ns[[0, -1]]))[:, :, :2]
@@ -333,7 +358,7 @@ def _errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, A
             'odometry': rounded(by_odometry)}
 
 
-def _shown(states: IntArray) -> IntArray:
+def shown(states: IntArray) -> IntArray:
     """Return which measurements of a source are in run.json: of very many, only some."""
     believed = np.isin(states, (BELIEVED, HELD_OUT))
     others, rest = np.flatnonzero(~believed), np.flatnonzero(believed)

@@ -8,7 +8,7 @@ is as it should be. Covariances count as wrong if the interval of the factor on 
 beyond 1.5; where the engine has found so by itself and allows for it, that is a notice.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ from pose_graph_ros.core.sources.gyro import CONTRADICTORY
 LEVELS = ('warning', 'notice', 'good')
 MOST_SILENCES = 20  # of a source that are looked at
 MOST_TOLD = 3  # stretches and gaps that are told one by one
+MOST_SHOWN = 100  # closures that the map marks for a sentence
 MANY = 3  # measurements that are more than bad luck
 
 
@@ -37,6 +38,7 @@ class Finding(NamedTuple):
     level: str
     text: str
     anchor: str  # on the page: `map`, `updates`, `errors`, or `source-NAME`
+    at: Sequence[tuple[Seconds, Seconds]] = ()  # parts of the drive that it speaks of
 
 
 def findings(run: Run, analyses: Mapping[str, SourceAnalysis],
@@ -49,6 +51,12 @@ def findings(run: Run, analyses: Mapping[str, SourceAnalysis],
                   *_odometry(run, source, own)]
     found += [*silences(run.drive.arrived_ns, run.kinds, run.start_ns), *_refusals(run),
               *_others(run), *_path(run, errors)]
+    return in_order(found)
+
+
+def in_order(findings: Iterable[Finding]) -> list[dict[str, Any]]:
+    """Return findings for run.json, the worst first."""
+    found = [*findings]
     if all(each.level == 'good' for each in found):
         found.append(Finding('good', 'nothing was found that needs a person', 'map'))
     found.sort(key=lambda each: LEVELS.index(each.level))
@@ -170,7 +178,7 @@ def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[F
         size = f', {short(np.nanmedian(far))} m from the path' if np.any(np.isfinite(far)) else ''
         yield Finding('warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} '
                       f's to {end:.1f} s contradict the path and are not used{size}: look for '
-                      'reflections, or a jump of the receiver', 'map')
+                      'reflections, or a jump of the receiver', 'map', [(begin, end)])
     rest = len(at) - sum(map(len, long[:MOST_TOLD]))
     if rest > 0:
         more = ' more' if len(long) > 0 else ''
@@ -188,14 +196,23 @@ def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
         far = f', {worst.distance:.1f} sigma' if np.isfinite(worst.distance) else ''
         yield Finding(
             'warning' if len(doubted) >= MANY else 'notice', f'{source}: {len(doubted)} {of_all} '
-            f'contradict the others and are not used; the strongest: {worst.id}{far}', 'map')
+            f'contradict the others and are not used; the strongest: {worst.id}{far}', 'map',
+            _ends(run, doubted))
     for state, text in (
             (State.WAITING, 'are not used, as too little speaks for or against them'),
             (State.WEAKLY_BELIEVED,
              'are used, though little but the record of the source speaks for them')):
-        count = sum(each.state is state for each in every)
-        if count > 0:
-            yield Finding('notice', f'{source}: {count} {of_all} {text}', 'map')
+        some = [each for each in every if each.state is state]
+        if len(some) > 0:
+            yield Finding('notice', f'{source}: {len(some)} {of_all} {text}', 'map',
+                          _ends(run, some))
+
+
+def _ends(run: Run, closures: Sequence[Verdict]) -> list[tuple[Seconds, Seconds]]:
+    """Return the times of both ends of some closures."""
+    stamps = (stamp for each in closures[:MOST_SHOWN] for stamp in (
+        each.reference_ns, each.stamp_ns) if stamp is not None)
+    return [(at, at) for at in (round(1e-9 * (stamp - run.start_ns), 3) for stamp in stamps)]
 
 
 def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
@@ -205,7 +222,7 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
     for each in doubted[:MOST_TOLD]:
         at = (each.stamp_ns - run.start_ns) * 1e-9
         yield Finding('warning', f'{source}: odometry is wrong before {at:.1f} s: '
-                                 f'{sentence(each, run.start_ns)}', 'map')
+                                 f'{sentence(each, run.start_ns)}', 'map', [(at, at)])
     if len(doubted) > MOST_TOLD:
         yield Finding('warning', f'{source}: odometry is doubted in {len(doubted) - MOST_TOLD} '
                                  'more places', 'map')
@@ -258,7 +275,8 @@ def silences(arrived_ns: Mapping[str, Sequence[StampNs]], kinds: Mapping[str, Ki
                 'the motion there is not known')
         longest = float(np.max(lengths))
         yield Finding('warning' if longest > 20.0 else 'notice', f'{source}: no messages from '
-                      f'{where}{more} ({short(longest, 3)} s at most); {what}', f'source-{source}')
+                      f'{where}{more} ({short(longest, 3)} s at most); {what}', f'source-{source}',
+                      [(begin, end) for begin, end in told.tolist()])
 
 
 def _refusals(run: Run) -> Iterator[Finding]:
