@@ -99,7 +99,7 @@ INPUT = (
     Rule('odometry:(differential|relative)', CHANGED, BY_MOTION + ', as with differential: true'),
     Rule('fix:(differential|relative)', NOT_NEEDED,
          'fixes are positions on the Earth; the first one is the origin if datum is not set'),
-    Rule('(global_pose|imu):(differential|relative)', NOT_NEEDED, 'it is absolute here, too',
+    Rule('(global_pose|imu.*):(differential|relative)', NOT_NEEDED, 'it is absolute here, too',
          value=False),
     Rule('gyro:(differential|relative)', CHANGED, ROTATIONS, value=True),
     Rule('.*:(differential|relative)', NOT_NEEDED, 'only its rate is used'),
