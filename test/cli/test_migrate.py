@@ -100,6 +100,17 @@ def test_the_filter_that_publishes_odometry_stays_and_is_heard_once(tmp_path) ->
     assert values['odom.topic'] == 'odometry/local'
     assert values['outputs.filtered_odometry'] == 'odometry/global'
     assert 'Keep filter_odom: it publishes odom -> base_footprint' in text
+    # what only the replaced one hears is heard beside it
+    tree['filter_map'] |= {'odom2': 'visual', 'odom2_config': config('vx', 'vyaw')}
+    values, _ = migrated(tmp_path, tree)
+    assert values['sources'] == ['odom', 'odom2', 'fix']
+    assert (values['odom.topic'], values['odom2.topic']) == ('odometry/local', 'visual')
+    # as may be the output itself
+    tree['filter_map'] |= {'odom2': 'odometry/filtered'}
+    values, _ = migrated(tmp_path, tree)
+    assert values['sources'] == ['odom', 'fix']
+    assert values['odom.topic'] == 'odometry/filtered'
+    del tree['filter_map']['odom2']
     # where the driver publishes the transform, the sensors themselves
     values, text = migrated(tmp_path, tree, '--replace-local')
     assert values['sources'] == ['odom', 'fix', 'gyro']

@@ -86,28 +86,23 @@ class Migration:
 
     def _add_sources(self, inputs: Sequence[Input]) -> None:
         """Set the sources, and what their inputs tell of them."""
-        named: list[str] = []
+        named = ['odom'] if self.kept is not None else list[str]()
         navsats = self.of(System.NAVSAT)
         own = self._take_output(inputs)
         for one in inputs:
-            kinds = ['odometry'] if one is own else of.kinds_of(
+            kinds = [] if one is own else of.kinds_of(
                 one, inputs, with_fixes=len(navsats) > 0, in_map=(
                     one.section.system is System.FUSE or in_map(one.section)))
             if self.hears(one):  # an absolute heading is not what the filter's odometry tells
                 kinds = [kind for kind in kinds if kind in ('imu', 'fix', 'global_pose')]
-            self.names[one] = {}
+            self.names[one] = {'odometry': 'odom'} if one is own else {}
             for kind in kinds:
-                name = of.free_name(one, kind, kinds, named, USUAL_NAMES.get(kind, ''))
-                if one is own:
-                    name = 'odom'
-                elif kind != 'fix' or 'fix' not in named:
+                # nobody knows the topic of a second receiver
+                if kind != 'fix' or 'fix' not in named:
+                    name = of.free_name(one, kind, kinds, named, USUAL_NAMES.get(kind, ''))
                     self._add_source(one, kind, name)
-                else:  # nobody knows the topic of a second receiver
-                    continue
-                named.append(name)
-                self.names[one][kind] = name
-        if self.kept is not None and own is None:
-            named.append('odom')
+                    named.append(name)
+                    self.names[one][kind] = name
         moving = [name for name in named if KINDS[self.type_of(name)].is_odometry]
         others = [name for name in named if name not in moving]
         if len(navsats) > 0 and 'fix' not in named:
@@ -136,7 +131,7 @@ class Migration:
 
     def _add_source(self, one: Input, kind: str, name: str) -> None:
         topic, use = (place(one.section, *keys) for keys in ((one.topic_key,), one.use_keys))
-        if name not in KNOWN_SOURCES:
+        if name not in KNOWN_SOURCES or KNOWN_SOURCES[name][0].name != kind:
             self._set(f'{name}.type', kind, use)
         if kind == 'fix':
             self._set('fix.topic', 'gps/fix', f'{topic}: what {one.topic} is made of')
@@ -151,8 +146,11 @@ class Migration:
                       'is estimated and bends no path')
             self._set(f'{name}.sigma_floor', [0.01, 0.1], 'how much that may be [m, rad]')
         for navsat in self.of(System.NAVSAT) if kind == 'imu' else []:
-            if (angle := sum(float(navsat.values.get(part, 0.0)) for part in ANGLES)) != 0.0:
-                self._set(f'{name}.yaw_offset', round(angle, 9), place(navsat, *ANGLES))
+            angles = [navsat.values.get(part, 0.0) for part in ANGLES]
+            if any(isinstance(each, bool) or not isinstance(each, int | float) for each in angles):
+                raise ConfigError(f'{place(navsat, *ANGLES)}: expected numbers, got {angles}')
+            if sum(angles) != 0.0:
+                self._set(f'{name}.yaw_offset', round(sum(angles), 9), place(navsat, *ANGLES))
 
     def type_of(self, source: str) -> str:
         """Return the type of a source, which is given or usual for its name."""
@@ -178,15 +176,20 @@ class Migration:
                     self.replaced is None and name in parameters.FRAMES):
                 self._note(section, name, Fate.NOT_NEEDED, 'unchanged, in the filter that stays'
                            if section is self.kept else 'of a filter that is not needed any more')
-            elif section.system is not System.NAVSAT or not self._judge_angle(
-                    section, name, value):
+            elif section.system is System.NAVSAT and self._judge_angle(section, name, value):
+                pass
+            else:
                 one = next((each for each in inputs if re.fullmatch(
                     rf'{re.escape(each.name)}[_.].+', name)), None)
-                self._apply(section, name, value, _rule(
-                    section.system, plugins, name, value) if one is None else tables.rule_of(
+                if one is None:
+                    rule, source = _rule(section.system, plugins, name, value), ''
+                else:
+                    names = self.names[one]
+                    source = next(iter(names.values()), '')
+                    rule = tables.rule_of(
                         tables.INPUT_OF_FUSE if len(plugins) > 0 else tables.INPUT,
-                        f'{"+".join(self.names[one]) or "none"}:{name[len(one.name) + 1:]}',
-                        value), '' if one is None else next(iter(self.names[one].values()), ''))
+                        f'{"+".join(names) or "none"}:{name[len(one.name) + 1:]}', value)
+                self._apply(section, name, value, rule, source)
 
     def _judge_input(self, one: Input) -> list[str]:
         """Note what an input became; return the parameters of which that tells."""
@@ -245,8 +248,8 @@ class Migration:
 def _rule(system: System, plugins: dict[str, str], name: str, value: Any) -> Rule:
     """Return what becomes of a parameter that is of no input."""
     model = re.fullmatch(r'(?:sensor_models|publishers)\.(.+)\.type', name)
-    owner = model[1] if model else next(
-        (each for each in plugins if name.startswith(f'{each}.')), '')
-    return tables.rule_of(RULES[system] if owner == '' else tables.PLUGINS.get(
-        plugins[owner], tables.UNKNOWN_PLUGIN), 'type' if model else name.removeprefix(
-            f'{owner}.') if owner != '' else name, value)
+    if (owner := model[1] if model else next(
+            (each for each in plugins if name.startswith(f'{each}.')), '')) == '':
+        return tables.rule_of(RULES[system], name, value)
+    return tables.rule_of(tables.PLUGINS.get(plugins[owner], tables.UNKNOWN_PLUGIN),
+                          'type' if model else name.removeprefix(f'{owner}.'), value)

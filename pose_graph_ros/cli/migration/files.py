@@ -101,7 +101,7 @@ def _system(values: Mapping[str, Any]) -> System | None:
 
 def _flat(tree: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
     for name, value in tree.items():
-        named = {each['name']: {key: own for key, own in each.items() if key != 'name'}
+        named = {str(each['name']): {key: own for key, own in each.items() if key != 'name'}
                  for each in value if isinstance(each, Mapping) and 'name' in each
                  } if isinstance(value, list) else {}  # plugins of fuse in ROS 1
         if isinstance(value, Mapping) or len(named) > 0:

@@ -81,12 +81,12 @@ def of_smoother(section: Section) -> Iterator[Input]:
     for name, kind in plugins(section).items():
         if kind in OF_FUSE:
             own = {leaf: section.values[f'{name}.{leaf}'] for leaf in ('topic', *DIMENSIONS)
-                   if f'{name}.{leaf}' in section.values}
+                   if isinstance(section.values.get(f'{name}.{leaf}'), str | list)}
             yield Input(section, name, OF_FUSE[kind], str(own.get('topic', name)),
                         f'{name}.topic', tuple(f'{name}.{leaf}' for leaf in DIMENSIONS
                                                if leaf in own),
                         frozenset(DIMENSIONS[leaf] + str(each).lower() for leaf in DIMENSIONS
-                                  for each in own.get(leaf, ())),
+                                  for each in own.get(leaf, ()) if isinstance(each, str)),
                         section.values.get(f'{name}.differential') is True)
 
 

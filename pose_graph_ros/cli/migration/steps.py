@@ -25,15 +25,7 @@ def steps(migration: Migration) -> Iterator[str]:
     if len(stopped) > 0:
         yield f'Stop {" and ".join(stopped)}: this node does the work.'
     if kept is not None:
-        yield (f'Keep {kept.node}: it publishes {lower}, which this node does not. Its output is '
-               f'the odometry here, since {upper} has to fit that transform. Look up in your '
-               'launch file what odometry/filtered of it is remapped to, and write that to '
-               'odom.topic.')
-        if any(one.message == 'imu' for one in migration.heard):
-            yield ('There is no source of type gyro: what the IMU tells of turns is in the output '
-                   f'of {kept.node} already, and would count twice. More exact are the wheels and '
-                   'the gyroscope themselves, whose bias is then estimated: where the driver of '
-                   f'the wheels publishes {lower}, migrate with --replace-local.')
+        yield from _beside(migration, kept.node, upper, lower)
     elif replaced is not None and _publishes_odometry(replaced):
         yield (f'Let the driver of the wheels publish {lower}, which {replaced.node} did. This '
                f'node does not: its corrections are in {upper}. Or keep {replaced.node} for that, '
@@ -64,6 +56,19 @@ def steps(migration: Migration) -> Iterator[str]:
                'Loop closures are always listened to, on the topic loop_closure.')
     if settings['sources'].value[0] == 'odom' and 'no file' in settings['odom.topic'].why:
         yield 'Write the topic of the odometry to odom.topic: no file tells it.'
+
+
+def _beside(migration: Migration, node: str, upper: str, lower: str) -> Iterator[str]:
+    """Yield what is to be done with a filter that stays, given the transforms."""
+    yield (f'Keep {node}: it publishes {lower}, which this node does not. Its output is the '
+           f'odometry here, since {upper} has to fit that transform. Look up in your launch file '
+           'what odometry/filtered of it is remapped to, and write that to odom.topic.')
+    if any(one.message == 'imu' for one in migration.heard):
+        yield ('There is no source of type gyro: what the IMU tells of turns is in the output of '
+               f'{node} already, and would count twice. More exact are the wheels and the '
+               'gyroscope themselves, whose bias is then estimated.')
+    yield (f'Where the driver of the wheels publishes {lower} itself, {node} can go, too: migrate '
+           'with --replace-local.')
 
 
 def launch_call(migration: Migration, out: Path) -> str:

@@ -72,9 +72,9 @@ FILTER = (
     Rule('transform_timeout|tf_timeout|silent_tf_failure', NOT_NEEDED,
          'only /tf_static is read, and nothing waits for it'),
     Rule('tf_prefix', CHANGED, 'write the prefix into the names of the frames'),
-    Rule('print_diagnostics', NOT_NEEDED, '/diagnostics is always published'),
-    Rule('debug|debug_out_file', NOT_NEEDED, '`pose-graph report` shows a whole run'),
-    Rule('permit_corrected_publication', NOT_NEEDED, 'the topic path has all corrected poses'),
+    Rule('print_diagnostics|debug|debug_out_file|permit_corrected_publication', NOT_NEEDED,
+         '/diagnostics and the corrected path are always published, and `pose-graph report` shows '
+         'a whole run'),
     Rule('publish_acceleration', NONE, 'there is no accel/filtered: ' + GRAVITY, value=True),
     Rule('smooth_lagged_data|history_length', NOT_NEEDED, DELAYS),
     Rule('reset_on_time_jump', NOT_NEEDED, 'a clock that is set back begins a new graph'),
@@ -99,7 +99,7 @@ INPUT = (
     Rule('odometry:(differential|relative)', CHANGED, BY_MOTION + ', as with differential: true'),
     Rule('fix:(differential|relative)', NOT_NEEDED,
          'fixes are positions on the Earth; the first one is the origin if datum is not set'),
-    Rule('(global_pose|imu):(differential|relative)', NOT_NEEDED, 'it is absolute here, too',
+    Rule('(global_pose|imu.*):(differential|relative)', NOT_NEEDED, 'it is absolute here, too',
          value=False),
     Rule('gyro:(differential|relative)', CHANGED, ROTATIONS, value=True),
     Rule('.*:(differential|relative)', NOT_NEEDED, 'only its rate is used'),
@@ -123,15 +123,13 @@ NAVSAT = (
     Rule('yaw_offset|magnetic_declination_radians', CHANGED, 'no compass is needed: fixes tell '
          'how odometry lies in the map, whose x axis points east, not to where an IMU reads 0; '
          'the third number of datum turns it'),
-    Rule('use_odometry_yaw|delay', NOT_NEEDED,
-         'how odometry lies in the map is found from its motion and the fixes, while it drives'),
-    Rule('frequency', NOT_NEEDED, 'each fix is used when it comes'),
-    Rule('zero_altitude', NOT_NEEDED, 'the map is a plane'),
+    Rule('frequency|delay|use_odometry_yaw', NOT_NEEDED, 'each fix is used when it comes, and all '
+         'together tell how odometry lies in the map'),
+    Rule('zero_altitude|use_local_cartesian', NOT_NEEDED,
+         'the map is a plane that touches the Earth, without UTM zones'),
     Rule('publish_filtered_gps', NOT_NEEDED, 'gps/filtered is always published'),
     Rule('broadcast_(utm|cartesian)_transform(_as_parent_frame_?)?', NONE, 'there is no frame '
          'utm: gps/filtered, toLL and fromLL tell positions on the Earth', value=True),
-    Rule('use_local_cartesian', NOT_NEEDED, 'the map always is a local tangent plane, without '
-         'UTM zones'),
     Rule('transform_timeout|tf_prefix|world_frame|base_link_frame', NOT_NEEDED,
          'only /tf_static is read: of the antenna'),
 )
@@ -160,9 +158,8 @@ SLAM_TOOLBOX = (
          'to the topic loop_closure; which are believed is decided here'),
     Rule('(position|yaw)_covariance_scale', CHANGED, 'global_pose.covariance_scale is for poses '
          'of slam_toolbox as source global_pose'),
-    Rule('debug_logging', NOT_NEEDED, 'log_level:=debug in the launch call'),
-    Rule('transform_timeout|tf_buffer_duration|stack_size_to_use|use_lifecycle_manager',
-         NOT_NEEDED, 'only /tf_static is read, and files need no stack'),
+    Rule('debug_logging|transform_timeout|tf_buffer_duration|stack_size_to_use|use_lifecycle_'
+         'manager', NOT_NEEDED, 'only /tf_static is read; log_level:=debug in the launch call'),
     Rule('enable_interactive_mode|interactive_mode|paused_.*', CHANGED, 'what a person decides '
          'goes to the topic ~/judge; ~/pause holds the node'),
     Rule('use_map_saver|map_name|map_update_interval|resolution|max_laser_range', NONE,
