@@ -91,9 +91,22 @@ install_tools() {
     else pip install -c "$VENV/constraints.txt" -e '.[test,dev]'; fi
 }
 
-build_tf2() { # the wheels have no tf2_msgs, but what makes Python modules of messages
-    local prefix=$PWD/$VENV include packages
+# The wheels have neither tf2_msgs nor robot_localization, but what makes Python modules of messages.
+build_tf2() {
     if [ "$VENV" = .venv-ros ]; then "$VENV/bin/python" -c 'import tf2_msgs.msg'; return; fi
+    build_messages dev/tf2_msgs
+}
+
+build_compatible() { # what is installed already, with ROS or by hand, is left alone
+    if "$VENV/bin/python" -c 'import geographic_msgs.msg, robot_localization.srv' &&
+        [ ! -e build/geographic_msgs ]; then return; fi
+    if [ "$VENV" = .venv-ros ]; then return 1; fi
+    build_messages dev/compatible_msgs/geographic_msgs &&
+        build_messages dev/compatible_msgs/robot_localization
+}
+
+build_messages() { # folder of the package
+    local prefix=$PWD/$VENV build=build/${1##*/} include packages
     include=$("$VENV/bin/python" -c 'import sysconfig as s; print(s.get_path("include"))')
     packages=$("$VENV/bin/python" -c 'import sysconfig as s; print(s.get_path("purelib"))')
     # Their cmake files name the folders of the image that they were built in. sed writes new files;
@@ -101,12 +114,12 @@ build_tf2() { # the wheels have no tf2_msgs, but what makes Python modules of me
     sed -Ei -e "s#/opt/python/cp[0-9]+-cp[0-9]+/include/python3\.[0-9]+#$include#g" \
         -e "s#/opt/python/cp[0-9]+-cp[0-9]+/lib/python3\.[0-9]+/site-packages#$packages#g" \
         "$prefix"/share/*/cmake/*.cmake
-    rm -rf build/tf2_msgs
-    AMENT_PREFIX_PATH=$prefix PATH=$prefix/bin:$PATH cmake -S dev/tf2_msgs -B build/tf2_msgs \
+    rm -rf "$build"
+    AMENT_PREFIX_PATH=$prefix PATH=$prefix/bin:$PATH cmake -S "$1" -B "$build" \
         -DCMAKE_INSTALL_PREFIX="$prefix" -DCMAKE_PREFIX_PATH="$prefix" -DCMAKE_BUILD_TYPE=Release \
         -DPython3_EXECUTABLE="$prefix/bin/python" -DPython3_FIND_VIRTUALENV=ONLY -DBUILD_TESTING=OFF &&
         AMENT_PREFIX_PATH=$prefix PATH=$prefix/bin:$PATH \
-            cmake --build build/tf2_msgs --parallel "$(nproc)" --target install
+            cmake --build "$build" --parallel "$(nproc)" --target install
 }
 
 mkdir -p build
@@ -127,6 +140,12 @@ fi
 if [[ " $* " != *' --demo '* ]]; then
     step tf2_msgs 'building tf2_msgs (about 10 s)' dev/tf2_msgs build_tf2 ||
         warn "no /tf: needs g++, cmake, make, python3-dev; in a sourced ROS tf2_msgs (log: $LOG)"
+fi
+if [[ " $* " = *' --test '* ]]; then
+    step compatible_msgs 'building what the tests call of robot_localization (about 30 s)' \
+        dev/compatible_msgs build_compatible ||
+        warn "compatible:=robot_localization is not tested: needs what tf2_msgs needs; in a sourced ROS" \
+            "geographic_msgs and robot_localization (log: $LOG)"
 fi
 step kernels 'compiling the solver (20 s to two minutes)' "cache:${NUMBA_CACHE_DIR:-} pose_graph_ros/core" \
     "$VENV/bin/python" -m pose_graph_ros.cli.main compile-kernels ||

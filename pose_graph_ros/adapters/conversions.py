@@ -55,16 +55,25 @@ class Datum:
     """
 
     def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
-        self.yaw = float(given[2]) if len(given) == 3 else 0.0
-        self.is_given = len(given) > 0  # whether the datum comes from the parameter
+        self.plane: TangentPlane | None = None
+        self.yaw = 0.0
+        self.is_given = False  # whether the datum comes from the parameter, or a person
         self.is_of_graph = False  # whether the datum comes from a loaded graph
-        self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
         self.altitude = math.nan  # of the newest fix in the graph that has one [m]
         self.waits = wait  # whether fixes are refused without a plane, until a call of `renew`
         # a plane lies on the ellipsoid until an altitude is known; east and north do not change
-        self._to_lift = self.is_given
+        self._to_lift = False
         # fixes are placed by the thread of the engine
         self._lock = threading.Lock()
+        if len(given) > 0:
+            self.give(*given)
+
+    def give(self, latitude: float, longitude: float, yaw: float = 0.0) -> None:
+        """Use a given datum from now on; raises ValueError if it is not on Earth."""
+        plane = TangentPlane(latitude, longitude, yaw=yaw)
+        with self._lock:
+            self.plane, self.yaw, self.is_given = plane, float(yaw), True
+            self.waits, self._to_lift = False, True
 
     def keep(self, origin: MapOrigin) -> None:
         """Use the datum of a loaded graph from now on."""

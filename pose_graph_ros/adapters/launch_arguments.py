@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from pathlib import Path
 import re
 
-from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
+from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS, ROBOT_LOCALIZATION
 from pose_graph_ros.adapters.parameters import LIKENESS
 from pose_graph_ros.adapters.sources import CLOSURES, KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
@@ -34,6 +34,8 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
         'rviz_config': (str(config / 'pose_graph.rviz'), 'configuration of RViz'),
         'state_file': (AS_IN_FILE, 'file in which the node keeps all that it accepts, and from '
                        'which it continues when it is started again'),
+        'compatible': (AS_IN_FILE, f'{ROBOT_LOCALIZATION}: offer the services of its nodes as '
+                       'well, such as fromLL'),
         'sources': (AS_IN_FILE, 'names of the sources, such as [odom, fix, gyro]'),
         **{source: (AS_IN_FILE, f'topic of the input, {kind.message_type}; sets {source}.topic' + (
             '' if source in {*DEFAULT_SOURCES, CLOSURES} else f', if sources lists {source}'))
@@ -82,8 +84,7 @@ def parameters(given: Mapping[str, str]) -> dict[str, bool | str | list[str]]:
         values['sources'] = names = re.findall(r'[^\s,\[\]\'"]+', given['sources'])
         if len(names) == 0:
             raise ConfigError(f'argument sources: expected names, got {given["sources"]!r}')
-    if 'state_file' in own:
-        values['state_file'] = given['state_file']
+    values |= {name: given[name] for name in ('state_file', 'compatible') if name in own}
     # not by remaps: one of /odometry/filtered would move the input as well as the output
     return values | {f'{name}.topic': given[name] for name in KNOWN_SOURCES if name in own} | {
         f'outputs.{name}': given[name] for name in OUTPUTS if name in own}

@@ -26,6 +26,7 @@ OUTPUTS = {
     'verdicts': ('~/verdicts', 'diagnostic_msgs/msg/DiagnosticArray', 'verdicts'),
     'diagnostics': ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'diagnostics')}
 """Default topic, type and content of the outputs."""
+ROBOT_LOCALIZATION = 'robot_localization'
 
 
 class Change(Enum):
@@ -133,6 +134,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               'hidden nodes stay in the graph: one leaves it if an older one stays within this '
               'distance and its position relative to that is certain. If 0, all stay. Twice the '
               'distance between hidden nodes is a good value.', 0.0, 1000.0),
+    Parameter('compatible', 'none', '', 'Whose services the node offers as well: with '
+              '`robot_localization` those of its `ekf_node` and `navsat_transform_node`, by their '
+              'names and types, such as `fromLL`.', choices=('none', ROBOT_LOCALIZATION),
+              change=Change.START),
     *(Early(f'outputs.{name}', topic, '', f'Topic of the {content}.')
       for name, (topic, _, content) in OUTPUTS.items()),
 )

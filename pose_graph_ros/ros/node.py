@@ -16,7 +16,7 @@ from pose_graph_ros.adapters import parameters as rules
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros import log, services, session, topics
+from pose_graph_ros.ros import compatible, log, services, session, topics
 from pose_graph_ros.ros.graph_folder import with_folder
 
 logger = logging.getLogger(__name__)
@@ -133,7 +133,8 @@ class PoseGraphNode(LifecycleNode):
         self._session = session.Session(self, values)
         if self._service_thread is None:
             self._service_thread = services.ServiceThread(self)
-        self._offered = services.Services(self, self._session, self._service_thread)
+        offer = services.Services if values['compatible'] == 'none' else compatible.Compatible
+        self._offered = offer(self, self._session, self._service_thread)
 
     def close(self) -> None:
         """Stop the worker and destroy all that was configured."""

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.service import Service
 from std_srvs.srv import SetBool, Trigger
 
-from pose_graph_ros.adapters.sources import backend_config
+from pose_graph_ros.adapters.sources import backend_config, IMU
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
@@ -79,9 +79,10 @@ class Services:
     def __init__(self, node: Node, session: Session, thread: ServiceThread) -> None:
         self._node, self._session, self._thread = node, session, thread
         self._closed = self._saving = False
-        self._quick = [node.create_service(Trigger, '~/reset', self._answering(self._reset)),
-                       node.create_service(SetBool, '~/pause', self._answering(self._pause))]
-        self._waiting = [
+        self._quick: list[Service] = [
+            node.create_service(Trigger, '~/reset', self._answering(self._reset)),
+            node.create_service(SetBool, '~/pause', self._answering(self._pause))]
+        self._waiting: list[Service] = [
             thread.node.create_service(Trigger, name, self._answering(act)) for name, act in (
                 ('optimize', self._optimize), ('set_datum', self._set_datum),
                 ('undo_reset', self._undo_reset), ('save_graph', self._with_file(self._save)),
@@ -103,16 +104,19 @@ class Services:
     def _answering(self, act: Callable[[Any], Answer]) -> Callable[[Any, Any], Any]:
         """Return the callback of a service, which never raises."""
         def answer(request: Any, response: Any) -> Any:
-            try:
-                done = (False, CLOSED) if self._closed else act(request)
-            except CancelledError:
-                done = False, CLOSED if self._closed else REPLACED
-            except Exception as error:
-                logger.exception('a service failed')
-                done = False, f'failed: {type(error).__name__}: {error}'
-            response.success, response.message = done
+            response.success, response.message = self._done(lambda: act(request))
             return response
         return answer
+
+    def _done(self, act: Callable[[], Answer]) -> Answer:
+        """Do what is asked for, and return the answer, whatever happens."""
+        try:
+            return (False, CLOSED) if self._closed else act()
+        except CancelledError:
+            return False, CLOSED if self._closed else REPLACED
+        except Exception as error:
+            logger.exception('a service failed')
+            return False, f'failed: {type(error).__name__}: {error}'
 
     def _require_present(self, worker: Worker) -> None:
         """Raise `CancelledError` if a worker's graph is no longer that of the node."""
@@ -184,6 +188,18 @@ class Services:
 
     def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""
+        datum = self._session.input.reader.datum
+        if datum.is_given:
+            return False, 'refused: it is given, by the parameter or the service datum'
+        if (refusal := self._datum_refusal()) != '':
+            return False, refusal
+        datum.renew()
+        return True, 'the next good fix will be the datum'
+
+    def _datum_refusal(self, *, is_turned: bool = False) -> str:
+        """
+        Return why the datum cannot be another one, whose map may be turned; empty if it can.
+        """
         session, worker = self._session, self._session.worker
         for _ in range(10):  # more may be posted meanwhile
             if worker.status.processed < session.input.posted:
@@ -192,18 +208,18 @@ class Services:
         status, datum = worker.status, session.input.reader.datum
         used = sum(status.counts[name, 'accepted'] for name, source
                    in session.input.reader.sources.items() if source.kind.on_earth)
-        if datum.is_given:
-            return False, 'refused: it is given by the parameter datum'
+        headings = sum(status.counts[name, 'accepted'] for name, source
+                       in session.input.reader.sources.items() if source.kind is IMU)
         if datum.is_of_graph:
-            return False, 'refused: the graph that was loaded refers to the present datum'
+            return 'refused: the graph that was loaded refers to the present datum'
         if (plane := datum.plane) is not None and used > 0:
-            return False, (f'refused: {used} fixes in the graph refer to the datum '
-                           f'[{plane.latitude:.9f}, {plane.longitude:.9f}]')
+            return (f'refused: {used} fixes in the graph refer to the datum '
+                    f'[{plane.latitude:.9f}, {plane.longitude:.9f}]')
+        if is_turned and headings > 0:
+            return f'refused: {headings} headings in the graph refer to the present x axis'
         if plane is not None and (status.pending > 0 or status.processed < session.input.posted):
-            return False, ('refused: measurements that wait for odometry may refer to the '
-                           'present datum')
-        datum.renew()
-        return True, 'the next good fix will be the datum'
+            return 'refused: measurements that wait for odometry may refer to the present datum'
+        return ''
 
     def _with_file(self, act: Callable[[Path], str]) -> Callable[[Trigger.Request], Answer]:
         """Return an action on the file of the graph."""

@@ -67,6 +67,7 @@ class Session:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
+        self._given_datum: dict[str, list[float]] = {}  # instead of the parameter
         self._config = backend_config(values)
         path, datum = initial_graph(values)
         self.input = Input(values, self._publishers)
@@ -153,7 +154,7 @@ class Session:
         """Create the subscriptions and start the timers."""
         sources = self.input.reader.sources.values()
         callbacks: dict[str, Callable[[Any], None]] = {
-            'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
+            'initialpose': self.receive_pose, 'set_pose': self.receive_pose,
             # the worker is replaced with the graph
             topics.JUDGE_TOPIC: lambda message: self.worker.decide(message)}  # noqa: PLW0108
         if any(source.kind.in_frames for source in sources):
@@ -213,7 +214,7 @@ class Session:
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
-        self.values = dict(values)
+        self.values = {**values, **self._given_datum}
         self._config = config = backend_config(values)
         self.input.reader.configure(values)
         self.out.configure(values)
@@ -224,6 +225,14 @@ class Session:
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if self.active:
             self._watch_time()
+
+    def set_datum(self, given: Sequence[float]) -> None:
+        """Use a datum as if the parameter gave it; raises ValueError if it is not on Earth."""
+        self.input.reader.datum.give(*given)
+        # a new graph has it as well
+        self._given_datum['datum'] = self.values['datum'] = [*given]
+        if self.journal is not None:
+            self._keep_state()
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         timer, period_ns = self._timers.get(name), round(period * quantities.NANOSECONDS)
@@ -261,7 +270,7 @@ class Session:
             elif not self.input.paused:
                 self.worker.request_update()  # with this sample
 
-    def _on_set_pose(self, message: Message) -> None:
+    def receive_pose(self, message: Message) -> None:
         """Receive a pose that a user sets."""
         answer = PAUSED if self.input.paused else self._set_pose_input.receive(
             message, early=self.worker.estimate is None)

@@ -16,7 +16,7 @@ from pose_graph_ros.adapters.launch_arguments import (
     unknown,
 )
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
-from pose_graph_ros.adapters.parameters import all_parameters
+from pose_graph_ros.adapters.parameters import all_parameters, checked
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -64,6 +64,14 @@ def test_an_output_is_moved_without_moving_an_input_of_the_same_name(output: str
     assert remappings(given) == TF, 'a remap would move both'
     assert (OUTPUTS[output][0], '/new') in display_remappings(given), 'RViz has no such parameter'
     assert f'outputs.{output}' in {parameter.name for parameter in all_parameters({})}
+
+
+def test_services_of_robot_localization_are_asked_for_by_name() -> None:
+    given = parameters({**DEFAULTS, 'compatible': 'robot_localization'})
+    assert given == {'compatible': 'robot_localization'}
+    assert checked(given)['compatible'] == 'robot_localization'
+    with pytest.raises(ConfigError, match='compatible: expected one of none, robot_localization'):
+        checked(parameters({**DEFAULTS, 'compatible': 'fuse'}))
 
 
 @pytest.mark.parametrize('text', ['[odom, fix]', 'odom,fix', "['odom', \"fix\"]", ' odom fix '])

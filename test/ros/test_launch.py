@@ -44,7 +44,7 @@ def test_every_argument_is_used() -> None:
     used = {node.value for node in ast.walk(TEXT) if isinstance(node, ast.Constant)}
     assert set(ARGUMENTS) - used == {
         'params_file', 'remap_tf', 'use_sim_time', 'autostart', 'sources', 'state_file',
-        *KNOWN_SOURCES, *launch_arguments.OUTPUTS}, 'and these by launch_arguments'
+        'compatible', *KNOWN_SOURCES, *launch_arguments.OUTPUTS}, 'and these by launch_arguments'
 
 
 def test_launch_makes_the_node_and_rviz_only_if_it_is_there(

@@ -123,7 +123,7 @@ def test_parameters_may_be_whole_numbers_and_unknown_ones_are_warned_of(
     plane = managed.session.input.reader.datum.plane
     assert (plane.latitude, plane.longitude) == (48.0, 11.0)
     assert not node.has_parameter('fix.topic')
-    assert managed.call('set_datum').message == 'refused: it is given by the parameter datum'
+    assert managed.call('set_datum').message.startswith('refused: it is given')
 
 
 @pytest.mark.parametrize('managed', [{'diagnostics_period': 30.0}], indirect=True)
