@@ -132,7 +132,8 @@ class Compatible(Services):
             # where `gps/filtered` lies, so that this is the inverse of toLL
             level = level if math.isfinite(level) else plane.altitude
             good = (np.abs(place) <= (90.0, 360.0)).all(axis=1)
-            found[good] = plane.to_map(*place[good].T, np.full(good.sum(), level))
+            latitude, longitude = place[good].T
+            found[good] = plane.to_map(latitude, longitude, np.full_like(latitude, level))
             answer = (True, '') if good.all() else (False, (
                 'expected latitude in [-90, 90] and longitude in [-360, 360], got '
                 f'{place[~good][0].tolist()}: NaN is answered'))
