@@ -138,4 +138,5 @@ class Compatible(Services):
                 'expected latitude in [-90, 90] and longitude in [-360, 360], got '
                 f'{place[~good][0].tolist()}: NaN is answered'))
         # the height is 0, or NaN as the rest
-        return [Point(x=x, y=y, z=0.0 * x) for x, y in found.tolist()], answer
+        return [Point(x=x, y=y, z=0.0 if math.isfinite(x) else x)
+                for x, y in found.tolist()], answer
