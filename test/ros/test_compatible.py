@@ -133,6 +133,7 @@ def test_a_datum_that_is_set_stays_and_is_refused_once_fixes_refer_to_another(
     assert 'datum: refused: datum: expected latitude in [-90, 90]' in node.stderr()
     set_datum(40.0, 0.0)
     set_datum(PLANE.latitude, 0.5)  # no fix refers to the one before
+    drive(client, 1.0, fixes=False)
     client.start_new_graph()
     drive(client, 3.0)
     expected = in_map(*PLACES[1], PLANE.altitude, 0.5)
