@@ -167,3 +167,10 @@ def test_the_list_beside_the_pages_of_the_site_has_each_of_them() -> None:
     listed = [re.sub(r'.*<(.*)>', r'\1', name) for names in parts.values() for name in names]
     pages = {page.relative_to(ROOT).with_suffix('') for page in ROOT.glob('docs/**/*.md')}
     assert not {page for page in pages if not any(page.match(name) for name in listed)}
+
+
+@pytest.mark.parametrize('folder', ['guides', 'tools'])
+def test_the_readme_of_a_folder_lists_its_other_pages(folder: str) -> None:
+    pages = {page.name for page in ROOT.glob(f'docs/{folder}/*.md')} - {'README.md'}
+    listed = (ROOT / 'docs' / folder / 'README.md').read_text(encoding='utf-8')
+    assert not {name for name in pages if f']({name})' not in listed}

@@ -28,6 +28,7 @@ PERIOD, LAP = 1.0, 20.0     # between scans that are kept; to one that may be th
 NEARBY, REACH = 3.0, 1.0    # between poses to compare; between points to match at the end [m]
 OFF, SHARE = 0.1, 0.8       # how far points may be off their lines [m]; how many must not be
 FLOOR = np.diag((0.03, 0.03, 0.005)) ** 2   # errors that all points share [m, m, rad]
+WEAK, LOST = 0.1, 10.0      # below this share of what tells of x and y, one is unknown [m]
 
 
 class ScanClosures(Node):
@@ -44,11 +45,11 @@ class ScanClosures(Node):
 
     def _keep(self, scan: LaserScan) -> None:
         stamp = Time.from_msg(scan.header.stamp).nanoseconds
-        if len(self._scans) > 0 and stamp - self._scans[-1][0] < PERIOD * 1e9:
-            return
         ranges = np.asarray(scan.ranges, dtype=float)
         angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))
         hit = (ranges > scan.range_min) & (ranges < scan.range_max)
+        if np.sum(hit) < 20 or (self._scans and stamp - self._scans[-1][0] < PERIOD * 1e9):
+            return
         points = (ranges * (np.cos(angles), np.sin(angles))).T[hit]
         self._scans.append((stamp, move(self._mounting, points)))
 
@@ -95,9 +96,9 @@ def move(pose: Sequence[float] | np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def match(points: np.ndarray, target: np.ndarray, pose: np.ndarray) -> tuple | None:
     """Return the pose of one scan in another, with its covariance, by point-to-line ICP."""
-    along = np.roll(target, -2, axis=0) - np.roll(target, 2, axis=0)
-    normals = along[:, ::-1] * (-1.0, 1.0) / np.hypot(*along.T)[:, None]
     tree = cKDTree(target)
+    around = target[tree.query(target, 10)[1]]
+    normals = np.linalg.svd(around - around.mean(axis=1, keepdims=True))[2][:, 1]
     for iteration in range(30):
         moved = move(pose, points)
         apart, nearest = map(np.asarray, tree.query(moved))
@@ -105,13 +106,15 @@ def match(points: np.ndarray, target: np.ndarray, pose: np.ndarray) -> tuple | N
         n, arm = normals[nearest[near]], moved[near] - pose[:2]
         error = np.sum(n * (moved[near] - target[nearest[near]]), axis=1)
         J = np.column_stack((n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]))
-        # what the points do not tell, such as the place along a corridor, stays as it was guessed,
         H = J.T @ J + 1e-6 * np.eye(3)
         pose = pose - np.linalg.solve(H, J.T @ error)
-    if np.sum(np.abs(error) < OFF) <= SHARE * len(points):
+    if np.sum(np.abs(error) < OFF) < SHARE * len(points):
         return None
-    # and gets a large variance
-    return pose, np.mean(error ** 2) * np.linalg.inv(H) + FLOOR
+    covariance = np.mean(error ** 2) * np.linalg.inv(H) + FLOOR
+    # the noise of the normals seems to tell the place along a corridor
+    known, axes = np.linalg.eigh(H[:2, :2])
+    covariance[:2, :2] += axes @ np.diag((known < WEAK * known[1]) * LOST ** 2) @ axes.T
+    return pose, covariance
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from sensor_msgs.msg import LaserScan
 
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.examples import scan_closures
 
 LASER = (0.3, -0.1, 0.5)
 """Where it is on the robot [m, m, rad]."""
@@ -36,6 +37,22 @@ def scan_at(seconds: float, random: np.random.Generator) -> LaserScan:
                         range_min=0.1, range_max=60.0, ranges=measured.tolist())
     message.header.stamp = odometry(START + seconds, 0.0, 0.0, 0.0).header.stamp
     return message
+
+
+def test_a_match_in_a_corridor_does_not_tell_the_place_along_it() -> None:
+    random = np.random.default_rng(1)
+    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False) + 1e-4
+    ranges = 1.5 / np.abs(np.sin(angles))
+    rays = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    old, new = ((ranges + 0.01 * random.standard_normal(720))[:, None] * rays for _ in range(2))
+    seen = ranges < 15.0
+    found = scan_closures.match(new[seen], old[seen], np.array((0.7, 0.1, 0.05)))
+    assert found is not None
+    pose, covariance = found
+    assert abs(pose[1]) < 0.02
+    along, across, _ = np.sqrt(np.diag(covariance))
+    assert along > 5.0
+    assert across < 0.2
 
 
 def revisit_error(path: list[PoseStamped]) -> float:
