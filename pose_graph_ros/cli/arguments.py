@@ -51,6 +51,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
       pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
       pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
       pose-graph replay my_bag --hold-out 5 --json | jq .errors
+      pose-graph replay my_bag --hold-out 4 --stretch 20 --truth truth.tum
     """
     parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
