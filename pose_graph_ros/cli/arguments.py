@@ -314,8 +314,9 @@ def _add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> No
                        'gyro'),
             ('--truth', 'only used for comparison: Odometry, PoseStamped or PoseWithCovariance'
                         f'Stamped; or a file, {", ".join(TRUTH_SUFFIXES)} (TUM or a table)')):
-        group.add_argument(option, metavar='TOPIC', help=text, type=_topic_or_file if (
-            option == '--truth') else _topic)
+        metavar, kind = ('TOPIC|FILE', _topic_or_file) if option == '--truth' else (
+            'TOPIC', _topic)
+        group.add_argument(option, metavar=metavar, help=text, type=kind)
     parser.add_argument('--align', action=argparse.BooleanOptionalAction, default=None,
                         help='compare the truth where it fits the path best (default: yes)')
     if hold_out:
