@@ -10,7 +10,7 @@ read like any other.
 """
 
 from bz2 import BZ2Decompressor
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
 import logging
@@ -231,14 +231,16 @@ class _Ros1:
                 if end == begin and form != 'none':     # it was being written
                     end = len(data)
                 yield from self._in_chunk(form, data[begin:end])
-            elif kind == _ROS1_CONNECTION:
-                self._define({**fields, **_fields(data[begin:end])})
-            elif kind == _ROS1_MESSAGE:
-                topic = self._topics.get(_number(fields.get(b'conn', b'')))
-                time = fields.get(b'time', b'')
-                if topic is not None and len(time) == 8:
-                    yield (topic, _number(time[:4]) * 10**9 + _number(time[4:]),
-                           bytes(data[begin:end]))
+            number = _number(fields.get(b'conn', b''))
+            if kind == _ROS1_CONNECTION and number not in self._topics:
+                about = {**fields, **_fields(data[begin:end])}
+                with suppress(KeyError, UnicodeDecodeError):
+                    self._topics[number] = self._connect(*(about[name].decode() for name in (
+                        b'topic', b'type', b'md5sum', b'message_definition')),
+                        about.get(b'latching') == b'1')
+            elif kind == _ROS1_MESSAGE and number in self._topics:
+                seconds, nanoseconds = (_number(fields.get(b'time', b'')[k:k + 4]) for k in (0, 4))
+                yield self._topics[number], seconds * 10**9 + nanoseconds, bytes(data[begin:end])
             self.complete |= kind == _ROS1_CHUNK_INFO
             at = end
 
@@ -251,15 +253,6 @@ class _Ros1:
             self.n_damaged += 1
             return
         yield from self._messages(content, 0)
-
-    def _define(self, fields: Mapping[bytes, bytes]) -> None:
-        """Note what a record of a connection says, unless another one said it."""
-        number = _number(fields.get(b'conn', b''))
-        with suppress(KeyError, UnicodeDecodeError):
-            if number not in self._topics:
-                self._topics[number] = self._connect(*(fields[name].decode() for name in (
-                    b'topic', b'type', b'md5sum', b'message_definition')),
-                    fields.get(b'latching') == b'1')
 
 
 def _number(data: bytes) -> int:

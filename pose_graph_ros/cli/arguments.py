@@ -51,6 +51,7 @@ def replay(parser: argparse.ArgumentParser) -> None:
       pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
       pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
       pose-graph replay my_bag --hold-out 5 --json | jq .errors
+      pose-graph replay my_bag --hold-out 4 --stretch 20 --truth truth.tum
     """
     parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
@@ -347,8 +348,9 @@ def _add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> No
                        'gyro'),
             ('--truth', 'only used for comparison: Odometry, PoseStamped or PoseWithCovariance'
                         f'Stamped; or a file, {", ".join(TRUTH_SUFFIXES)} (TUM or a table)')):
-        group.add_argument(option, metavar='TOPIC', help=text, type=_topic_or_file if (
-            option == '--truth') else _topic)
+        metavar, kind = ('TOPIC|FILE', _topic_or_file) if option == '--truth' else (
+            'TOPIC', _topic)
+        group.add_argument(option, metavar=metavar, help=text, type=kind)
     parser.add_argument('--align', action=argparse.BooleanOptionalAction, default=None,
                         help='compare the truth where it fits the path best (default: yes)')
     if hold_out:

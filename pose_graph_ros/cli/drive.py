@@ -77,7 +77,7 @@ class Drive:
     loop_sources: Sequence[str]
     map_axes: tuple[str, str] = ('x', 'y')
     arrived_ns: 'Mapping[str, Sequence[StampNs]]' = field(default_factory=dict)
-    """Stamps of what was measured and not held out, in the order of arrival, by source."""
+    """Stamps of what was measured, in the order of arrival, by source."""
     odometry_heights: FloatArray = field(default_factory=lambda: np.zeros(0))   # [m]
     truth_heights: FloatArray = field(default_factory=lambda: np.zeros(0))  # NaN: unknown [m]
     truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
@@ -314,8 +314,7 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
     fixes = list[Fix | GlobalPose | Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
-        if not held_out:
-            arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
+        arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
             case Fix() | GlobalPose() | Position():
                 fixes.append(measurement)

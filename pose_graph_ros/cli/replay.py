@@ -322,9 +322,10 @@ def _execute_bags(options: argparse.Namespace) -> int:
 
 def _execute_g2o(options: argparse.Namespace) -> int:
     """Replay a g2o file."""
-    if len(options.bags) > 1 or options.new_bag or options.live or options.begin or options.until:
+    if len(options.bags) > 1 or any((options.new_bag, options.live, options.begin, options.until,
+                                     options.hold_out, options.stretch)):
         raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
-                       '--from and --until')
+                       '--from, --until and --hold-out')
     require_datum(options.export, known=False)
     values, truth = shared.parameter_values(options, {'odom.noise': 'twist'}), truth_of(options)
     if truth.topic is not None:

@@ -148,7 +148,9 @@ def test_topics_of_ros_1_without_a_slash_can_be_named(named, tmp_path) -> None:
 def test_whole_stretches_of_the_drive_are_held_out(tmp_path, capsys) -> None:
     write_bag(tmp_path / 'bag', drive())
     replayed(tmp_path / 'out', tmp_path / 'bag', '--hold-out', 4, '--stretch', 5)
-    fixes_there, = json.loads((tmp_path / 'out' / 'run.json').read_text())['fixes']
+    told = json.loads((tmp_path / 'out' / 'run.json').read_text())
+    assert not any('no messages' in each['text'] for each in told['findings'])
+    (fixes_there,) = told['fixes']
     # the fourth stretch and the eighth, of 5 s each
     assert [state == HELD_OUT for state in fixes_there['state']] == [
         15.0 <= t < 20.0 or t >= 35.0 for t in fixes_there['t']]

@@ -31,6 +31,7 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io import g2o, graph_files
 from pose_graph_ros.core.io.journal_file import Batch, Entry, JournalFile
+from pose_graph_ros.core.io.path_files import read_path
 from pose_graph_ros.core.recovery import recovered
 
 Target = Callable[[bytes, Path], None]
@@ -200,6 +201,12 @@ def _read_bag(path: Path) -> None:
                 read_truth(bag, topic)
 
 
+def path_file(data: bytes, folder: Path) -> None:
+    file = folder / ('path.csv' if b',' in data else 'path.tum')
+    file.write_bytes(data)
+    read_path(file)
+
+
 def bag_mcap(data: bytes, folder: Path) -> None:
     (folder / 'bag.mcap').write_bytes(data)
     _read_bag(folder / 'bag.mcap')
@@ -318,7 +325,7 @@ def _fields(message: SimpleNamespace) -> Iterator[tuple[SimpleNamespace, str]]:
 
 
 TARGETS: dict[str, Target] = {target.__name__: target for target in (
-    graph_text, saved_text, saved_values, bag_mcap, bag_sqlite, bag_ros1, bag_folder,
+    graph_text, saved_text, saved_values, path_file, bag_mcap, bag_sqlite, bag_ros1, bag_folder,
     journal_file, journal_rows, parameter_file, parameter_options, message_bytes, message_fields,
     transforms)}
 

@@ -153,7 +153,7 @@ def read_path(path: Path) -> PathFile:
             words = line.split(',' if is_table else None)
             if len(words) != len(header):
                 raise FileFormatError(f'{where}: expected {len(header)} values, '
-                                      f'{" ".join(header)}, got {len(words)}')
+                                      f'{" ".join(header)[:80]}, got {len(words)}')
             stamp_ns, row = _row(where, dict(zip(header, words, strict=True)))
             stamps_ns.append(stamp_ns)
             values.extend(row)
@@ -180,7 +180,9 @@ def _header(where: str, line: str) -> tuple[str, ...]:
 def _row(where: str, words: Mapping[str, str]) -> tuple[int, list[float]]:
     """Return the stamp [ns], and place and heading in a line."""
     values = {}
-    for name in {'stamp', 'latitude', 'longitude', 'yaw', *TUM} & {*words}:
+    for name in (*TUM, 'latitude', 'longitude', 'yaw'):
+        if name not in words:
+            continue
         text, most = words[name].strip(), _LARGEST.get(name, LARGEST_COORDINATE)
         try:
             values[name] = float(text)
