@@ -374,6 +374,7 @@ function makeSpan(host, {t}, repaint) {
     shownTime.to = high < last ? high : Infinity;
     const isWhole = shownTime.from === -Infinity && shownTime.to === Infinity;
     if (isWhole) [from.value, to.value] = [first, last];
+    for (const each of [from, to]) each.setAttribute('aria-valuetext', clock(Number(each.value)));
     text.textContent = isWhole ? 'Map: the whole path'
       : `Map: ${clock(Math.max(low, first))} to ${clock(Math.min(high, last))}`;
     repaint();
