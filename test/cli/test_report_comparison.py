@@ -109,10 +109,10 @@ def test_figures_and_parameters_that_differ_are_beside_each_other(tmp_path, caps
     other['facts'][5]['value'] = '904'
     found = told(tmp_path, capsys, run, other)
     rows = {row[0]: row[1:] for table in found['figures'] for row in table['rows']}
-    assert rows['frequency'] == ['10.0', '5.0', '\u22125 (-50 %)']
+    assert rows['frequency'] == ['10.0', '5.0', '-5 (-50 %)']
     assert rows['new'] == ['by default', '[1, 2]', '']
     assert 'same' not in rows
-    assert rows['corrected path to truth, rms'] == ['0.92 m', '0.46 m', '\u22120.46 m (-50 %)']
+    assert rows['corrected path to truth, rms'] == ['0.92 m', '0.46 m', '-0.46 m (-50 %)']
     assert 'corrected path to truth: 0.46 m rms in B, 0.92 m in A (-50 %)' in texts(found)
     assert '2 parameters differ: frequency, new' in texts(found)
 

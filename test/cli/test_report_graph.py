@@ -112,3 +112,25 @@ def test_options_of_bags_are_refused_and_those_of_graphs_elsewhere(tmp_path, cap
         out, err = capsys.readouterr()
         assert (out, err.count('\n')) == ('', 1)
         assert said in err
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('VERTEX_SE2 0 1 2 0\n', ''),
+    ('VERTEX_SE2 3 0 0 0\nVERTEX_SE2 5 1 0 0\nEDGE_SE2 3 5 1 0 0 1 0 0 1 0 0\n',
+     'is not determined'),
+    ('VERTEX_SE2 3 0 0 0\nVERTEX_SE2 5 1 0 0\n', 'that begin at 5'),
+    ('VERTEX_SE2 8646911284551352320 0 0 0\nVERTEX_SE2 8646911284551352321 1 0 0\n'
+     'EDGE_SE2 8646911284551352320 8646911284551352321 1 0 0 1 0 0 1 0 1\n', 'certified')])
+def test_graphs_that_tell_little_have_a_report_as_well(text, said, tmp_path, capsys) -> None:
+    file = tmp_path / 'little.g2o'
+    file.write_text(text, encoding='ascii')
+    found = told(tmp_path, capsys, file)
+    assert said in ' '.join(each['text'] for each in found['findings'])
+
+
+def test_landmarks_alone_are_no_graph_to_report(tmp_path, capsys) -> None:
+    file = tmp_path / 'points.g2o'
+    file.write_text('VERTEX_XY 5 1 1\nVERTEX_XY 6 1 2\n', encoding='ascii')
+    assert main(['report', str(file), '--run', str(tmp_path / 'out')]) == 2
+    assert capsys.readouterr().err == (
+        f'error: {file}: expected poses, got landmarks alone\n')

@@ -533,7 +533,7 @@ def test_of_two_runs_it_shows_what_changed_and_where(show, two, width) -> None:
     assert [page.inner_text(f'nav li:nth-child({k}) a') for k in (1, 2, 3, 4)] == [
         'Figures', 'Map', 'Differences', 'Places']
     row = page.locator('#figures tr', has_text='loop_closure.robust')
-    assert row.locator('td').all_inner_texts() == ['judged', 'none', '']
+    assert row.locator('td').all_inner_texts() == ['by default', 'none', '']
     # closures that only B believes, with what A says of them
     entries = page.locator('details[data-kind=closure] .entry')
     assert entries.count() == len(two['closures'][0]['state']) > 0

@@ -189,7 +189,8 @@ function itemOf(kind, source, k) {
 
 function springItem(spring) {
   const ends = [spring.from, spring.to].filter((end) => end && known(end.x));
-  return {kind: 'spring', spring, source: spring.source, id: spring.name, reason: spring.text,
+  const id = spring.kind === 'difference' ? `at ${clock(spring.from.t)}` : spring.name;
+  return {kind: 'spring', spring, source: spring.source, id, reason: spring.text,
     times: ends.map((end) => end.t), ends: ends.map((end) => [end.x, end.y])};
 }
 
@@ -373,6 +374,7 @@ function makeSpan(host, {t}, repaint) {
     shownTime.to = high < last ? high : Infinity;
     const isWhole = shownTime.from === -Infinity && shownTime.to === Infinity;
     if (isWhole) [from.value, to.value] = [first, last];
+    for (const each of [from, to]) each.setAttribute('aria-valuetext', clock(Number(each.value)));
     text.textContent = isWhole ? 'Map: the whole path'
       : `Map: ${clock(Math.max(low, first))} to ${clock(Math.min(high, last))}`;
     repaint();
@@ -432,7 +434,9 @@ function factsOf({source, ends, times, tie, distance, spring}) {
   const time = (t) => [clock(t), timeOfDay(t)].filter((text) => text).join(' · ');
   const apart = ([x, y], [p, q]) => length(Math.hypot(x - p, y - q));
   const rows = [['source', source]];
-  if (ends.length === 2) {
+  if (ends.length === 2 && spring && spring.kind === 'difference') {
+    rows.push(['A', placeText(ends[0])], ['B', placeText(ends[1])], ['apart', apart(...ends)]);
+  } else if (ends.length === 2) {
     rows.push(['from', `${time(times[0])} at ${placeText(ends[0])}`],
       ['to', `${time(times[1])} at ${placeText(ends[1])}`], ['apart', apart(...ends)]);
   } else if (ends.length === 1) {

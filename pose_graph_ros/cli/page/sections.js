@@ -231,7 +231,7 @@ function showSprings() {
       x: `${(100 * x) / most}%`, width, height, y: (10 - height) / 2, fill: `var(--${fillName})`});
     return entry(item, onMap.choose, [
       make('span', {class: 'rank'}, rank),
-      make('span', {class: 'entry-name'}, isOfTwo ? `at ${clock(item.times[0])}` : name),
+      make('span', {class: 'entry-name'}, item.id),
       make('span', {class: 'kind'}, isOfTwo ? '' : kind),
       draw('svg', {class: 'bar', 'aria-hidden': 'true'}, bar(8, 0, '100%', 'line'),
         bar(8, 0, `${(100 * (energy || 0)) / most}%`, 'spring'), isOfTwo ? null : bar(10, expected || 0, 2, 'ink')),

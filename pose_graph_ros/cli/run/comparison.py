@@ -29,9 +29,8 @@ from pose_graph_ros.core.judgement.texts import short
 SAME_TIME = 0.0015  # as times are rounded to milliseconds [s]
 SAME_PLACE = 0.02  # as places are rounded to centimetres [m]
 MOST_PLACES = 10  # where the paths differ most
-PARAMETERS, NONE, MINUS = 'Parameters that differ', '\u2013', '\u2212'
+PARAMETERS, NONE = 'Parameters that differ', '\u2013'
 ERRORS = ('corrected path to truth', 'corrected path to fixes held out')
-Rows = list[list[str]]  # name, in A, in B, change
 
 
 class Apart(NamedTuple):
@@ -64,7 +63,7 @@ def compared(files: tuple[Path, Path]) -> dict[str, Any]:
               for table in ('fixes', 'closures')}
     lines = {'corrected': a['lines']['corrected'], 'other': {
         name: rounded(paths[1][k]) for k, name in enumerate('txy')}, 'odometry': None,
-        'truth': a['lines']['truth'] or _moved(b['lines']['truth'], moved)}
+        'truth': a['lines']['truth']}
     figures, errors = list(_figures(a, b, apart)), None if apart is None else {
         'against': 'B', 't': rounded(apart.t), 'position': rounded(apart.distance),
         'heading': rounded(apart.turn, 4), 'sigma': None, 'odometry': None}
@@ -87,11 +86,6 @@ def _path(run: Mapping[str, Any], later: float, moved: FloatArray) -> FloatArray
     path = run['lines']['corrected']
     t, x, y, theta = (np.array(path[name], dtype=float) for name in ('t', 'x', 'y', 'theta'))
     return np.array((t + later, x + moved[0], y + moved[1], np.unwrap(theta)))
-
-
-def _moved(line: Mapping[str, Any] | None, moved: FloatArray) -> dict[str, Any] | None:
-    return None if line is None else {
-        name: rounded(np.array(line[name]) + moved[k]) for k, name in enumerate('xy')}
 
 
 def _apart(a: FloatArray, b: FloatArray) -> Apart | None:
@@ -169,8 +163,8 @@ def _judged_otherwise(a: Mapping[str, Any], b: Mapping[str, Any], table: str, la
 def _figures(a: Mapping[str, Any], b: Mapping[str, Any],
              apart: Apart | None) -> Iterator[dict[str, Any]]:
     """Yield tables of what both runs tell, with what changed from A to B."""
-    def rows(named: list[dict[str, Any]], without: str = NONE) -> Rows:
-        """Return what is known by name in both, or in one of them."""
+    def rows(named: list[dict[str, Any]], without: str = NONE) -> list[list[str]]:
+        """Return what is known in both, or in one: its name, in A, in B, and the change."""
         return [[name, *(values := [each.get(name, without) for each in named]), _change(*values)]
                 for name in dict.fromkeys(name for each in named for name in each)]
 
@@ -221,7 +215,7 @@ def _change(one: str, other: str) -> str:
     change = after - size
     share = '' if size == 0.0 or abs(change) > 10.0 * abs(size) else (
         f' ({100.0 * change / abs(size):+.0f} %)')
-    return f'{"+" if change > 0.0 else MINUS}{short(abs(change), 3)}{unit}{share}'
+    return f'{"+" if change > 0.0 else "-"}{short(abs(change), 3)}{unit}{share}'
 
 
 def _split(text: str) -> tuple[float | None, str]:

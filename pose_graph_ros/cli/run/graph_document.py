@@ -23,6 +23,7 @@ from pose_graph_ros.cli.run.findings import Finding, MANY, MOST_SHOWN
 from pose_graph_ros.cli.run.sources import source_entry, SourceAnalysis, verdict
 from pose_graph_ros.cli.solved import solved_graph, SolvedGraph
 from pose_graph_ros.core.batch.optimizer import optimize, Status
+from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import FactorKind
@@ -42,6 +43,8 @@ DOUBTED = 'Doubted and not used: all others together agree better without it.'
 def solved_document(path: Path, edge2: str | None, robust: str | None) -> dict[str, Any]:
     """Return run.json of a graph, after solving it; raises FileFormatError."""
     problem = solve.Problem(read_file(path, edge2), plain=False)
+    if not np.any(problem.graph.is_pose):
+        raise FileFormatError(f'{path}: expected poses, got landmarks alone')
     before, chi2 = problem.graph.poses.copy(), problem.graph.energies().chi2
     found = solve.optimised(problem, argparse.Namespace(
         robust=robust, closure_sigma=BELIEF.closure_floors[::2], start='chordal',
@@ -60,7 +63,8 @@ def solved_document(path: Path, edge2: str | None, robust: str | None) -> dict[s
     drive = _drive(solved, stamps, times, rows)
     analyses, covariances = dict[str, SourceAnalysis](), np.full((len(drive.corrected), 3, 3),
                                                                  np.nan)
-    is_determined = found.solution.determined and result.status is not Status.FAILED
+    is_determined = found.solution.determined and result.status is not Status.FAILED and (
+        len(factors) > 0)
     if is_determined:
         # H at the optimum; the last step before it was linearised one step away
         optimize(graph, solve.CONFIG)
@@ -161,8 +165,8 @@ def _findings(problem: solve.Problem, solved: SolvedGraph, found: solve.Optimise
         yield Finding('warning', f'optimisation: {result.status.value}: {result.reason}', 'map')
     if len(problem.held) > 0:
         names = ', '.join(map(str, solved.ids[problem.held[:5]].tolist()))
-        yield Finding('notice', f'nothing holds {len(problem.held)} parts of the graph; their '
-                      f'first nodes are fixed: {names}', 'map')
+        yield Finding('notice', f'nothing holds the parts of the graph that begin at {names}; '
+                      'these nodes are fixed', 'map')
     if found.certificate is not None:
         yield Finding('good' if found.certificate['verdict'] == 'certified' else 'notice',
                       '; '.join(line.strip() for line in found.proof), 'map')
