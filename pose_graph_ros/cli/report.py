@@ -106,9 +106,11 @@ def _file(path: Path) -> Path | None:
     file = path / FILE if (path / FILE).is_file() else path
     if file.suffix == '.json':
         return file
-    if path.is_dir() and not (path / 'metadata.yaml').is_file():
+    # a recording that was cut off has no metadata.yaml
+    if path.is_dir() and not any(each.suffix in ('.yaml', '.zstd', *bags.BAG_FILE_SUFFIXES)
+                                 for each in path.iterdir()):
         raise FileFormatError(f'{path}: expected the folder of a replay or a demo with '
-                              f'{FILE}, or a rosbag2 with metadata.yaml')
+                              f'{FILE}, or a rosbag2')
     if path.is_file() and path.suffix not in BAG_SUFFIXES:
         raise FileFormatError(f'{path}: expected {FILE}, or a file with the suffix '
                               f'{", ".join(BAG_SUFFIXES)}')

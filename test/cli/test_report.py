@@ -154,3 +154,11 @@ def test_folders_that_are_no_runs_and_wrong_options_are_named(
     if os.getuid() != 0:
         (tmp_path / 'empty').chmod(0o500)
         assert run(folder, '-o', tmp_path / 'empty' / 'page.html') == 2
+
+
+def test_a_recording_that_was_cut_off_has_a_report(bag, tmp_path) -> None:
+    cut = tmp_path / 'cut'
+    cut.mkdir()
+    (file,) = bag.glob('*.mcap')
+    (cut / file.name).write_bytes(file.read_bytes()[:-1000])
+    assert run(cut, '--run', tmp_path / 'out') == 0

@@ -142,7 +142,7 @@ class Migration:
         if kind == 'global_pose' and 'yaw' not in one.uses:
             self._set(f'{name}.heading', 'never', f'{use}: no yaw')
         if kind == 'imu':
-            self._set(f'{name}.correlation_time', 600.0, 'what a compass is wrong by lasts, so it '
+            self._set(f'{name}.correlation_time', 60.0, 'what a compass is wrong by lasts, so it '
                       'is estimated and bends no path')
             self._set(f'{name}.sigma_floor', [0.01, 0.1], 'how much that may be [m, rad]')
         for navsat in self.of(System.NAVSAT) if kind == 'imu' else []:
