@@ -7,6 +7,7 @@ Times of steps are in microseconds. Ours is all that a caller from Python pays, 
 estimate included; of GTSAM only `ISAM2.update` is counted. Runs of the tools are interleaved in
 one process, figures are medians over the runs. A ratio is GTSAM's time divided by ours. Excess is
 half of chi2 above the batch optimum of the graph so far, each tool under its own error model.
+Online beside robot_localization and FusionCore: [filters](filters/README.md).
 """
 
 from collections.abc import Iterable

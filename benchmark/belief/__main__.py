@@ -116,7 +116,7 @@ def _summed(ratios: np.ndarray) -> str:
         f'{np.exp(np.mean(np.log(known))):.3f} ({np.max(known):.2f})')
 
 
-def _seeds(text: str) -> range:
+def seeds(text: str) -> range:
     """Return the seeds of `7` or `100-104`."""
     first, _, last = text.partition('-')
     return range(int(first), int(last or first) + 1)
@@ -127,7 +127,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog='python -m benchmark.belief',
         description='Measure which fixes are believed, beside an oracle that knows.')
-    parser.add_argument('--seeds', nargs='+', type=_seeds, default=[_seeds('100-104')],
+    parser.add_argument('--seeds', nargs='+', type=seeds, default=[seeds('100-104')],
                         metavar='N', help='as 7 or 100-104, which is the default')
     parser.add_argument('--scenarios', nargs='+', choices=SCENARIOS, default=SCENARIOS)
     parser.add_argument('--drives', nargs='+', choices=KINDS | RECORDED, default=KINDS | RECORDED)
