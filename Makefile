@@ -23,7 +23,7 @@ DEMO_ARGS = $(call option,BAG,bag) $(call option,ODOM,odom) $(call option,FIX,fi
 	$(call option,TRUTH,truth) $(call option,HOLD_OUT,hold-out) $(call option,RATE,rate) \
 	$(call option,OUT,out)
 
-.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench soak docs lint types fmt \
+.PHONY: help setup setup-demo setup-test demo test golden coverage fuzz bench soak docs guides lint types fmt \
 	lock clean
 
 help:
@@ -37,6 +37,7 @@ help:
 	@echo 'make bench   measure the engine against GTSAM; BENCH_ARGS="--quick --gate", or --help'
 	@echo 'make soak    a month through the engine and an hour through the node: hours, at low priority;'
 	@echo '             [SOAK_DAYS=30] [SOAK_HOURS=5 a day] [SOAK_MINUTES=60] [SOAK_OUT=build/soak]'
+	@echo 'make guides  run all commands of docs/guides/ for the tools: minutes'
 	@echo 'make docs    the pages of docs/ as a site: build/docs/index.html'
 	@echo 'make lint    ruff alone;  make types: mypy alone;  make fmt: let ruff mend what it can'
 	@echo 'make setup   set up alone: $(VENV), from wheels, or on top of ROS where one is sourced;'
@@ -85,6 +86,9 @@ soak: setup
 		-o $(SOAK_OUT)
 	@nice $(VENV)/bin/python -m benchmark.soak node --minutes $(SOAK_MINUTES) -o $(SOAK_OUT)
 	@$(VENV)/bin/python -m benchmark.soak page -o $(SOAK_OUT)
+
+guides: setup-test
+	@POSE_GRAPH_GUIDES=1 $(VENV)/bin/python -m pytest -q --timeout 1500 test/test_guides.py
 
 # in an environment of its own: the site needs nothing of the package, and no ROS
 docs: .venv-docs/bin/sphinx-build

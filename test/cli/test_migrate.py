@@ -309,19 +309,3 @@ def test_a_drive_with_a_migrated_file_is_as_near_the_truth_as_with_the_defaults(
     usual = error(capsys, drive)
     assert 0.05 < error(
         capsys, outdoor, '--params-file', str(tmp_path / 'out.yaml')) < 1.1 * usual
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('guide', ['from_robot_localization', 'from_fuse'])
-def test_the_commands_of_the_guides_run(tmp_path, monkeypatch, guide) -> None:
-    text = (ROOT / 'docs' / 'guides' / f'{guide}.md').read_text()
-    monkeypatch.chdir(tmp_path)
-    for kind, block in re.findall(r'^ *```(sh|yaml)\n(.*?)^ *```', text, re.DOTALL | re.M):
-        if kind == 'yaml':
-            Path(block.splitlines()[0].removeprefix('# ')).write_text(block)
-        for command in block.splitlines() if kind == 'sh' else []:
-            tool, *words = shlex.split(command)
-            if tool == 'pose-graph':
-                assert main(words) == 0
-            else:  # the call that is in the file
-                assert command.strip() in Path('pose_graph.yaml').read_text()
