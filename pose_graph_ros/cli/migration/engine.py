@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 from pose_graph_ros.adapters import parameters
 from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES
 from pose_graph_ros.cli.migration import inputs as of, tables
-from pose_graph_ros.cli.migration.files import in_map, place, Section, System
-from pose_graph_ros.cli.migration.inputs import Input, PLANAR
+from pose_graph_ros.cli.migration.inputs import in_map, Input, place, PLANAR, Section, System
 from pose_graph_ros.cli.migration.tables import Fate, Rule
 from pose_graph_ros.core.exceptions import ConfigError
 
