@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
+from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, read_inputs, reader_of
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY
 from pose_graph_ros.cli.truth import Heighted, path_of, Truth, UNKNOWN
 from pose_graph_ros.core import measurements as ms
@@ -241,7 +240,7 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
     The height of each pose of the first odometry is added to the heights, NaN if it has no pose.
     """
     start_ns: StampNs | None = None
-    for source, message, is_held_out in bags.read_inputs(bag, inputs):
+    for source, message, is_held_out in read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
         try:
