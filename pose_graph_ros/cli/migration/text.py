@@ -17,7 +17,7 @@ from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import KINDS
 from pose_graph_ros.cli.migration.engine import GLOBAL, Migration
 from pose_graph_ros.cli.migration.inputs import in_map, place, plugins, Section, System
-from pose_graph_ros.cli.migration.tables import Fate
+from pose_graph_ros.cli.migration.rules import Fate
 
 WIDTH = 97
 
