@@ -53,8 +53,9 @@ setup(
     maintainer='pose_graph_ros maintainers',
     maintainer_email='maintainers@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={f'{PACKAGE}.cli': [
-        f'page/{name}' for name in ('*.html', '*.css', '*.js', 'vendor/*')]},
+    package_data={
+        f'{PACKAGE}.cli': [f'page/{name}' for name in ('*.html', '*.css', '*.js', 'vendor/*')],
+        f'{PACKAGE}.cli.migration': ['rules.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

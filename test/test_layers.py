@@ -69,7 +69,7 @@ LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
-LOGIC = ('graph_folder', 'input', 'log', 'stored_graphs', 'watchdog', 'worker')
+LOGIC = ('input', 'log', 'stored_graphs', 'watchdog', 'worker')
 
 MOST_LINES = 450
 

@@ -58,16 +58,20 @@ The form is the encoding, of ROS 1 the MD5 sum of the type; and the quality whet
 _Message = tuple[Connection, int, bytes]    # and when it was recorded [ns]
 
 
-class _Mcap:
-    """An mcap file, cut short or with damaged bytes."""
+class _Walked:
+    """A file that is walked through from its start."""
 
     def __init__(self, path: Path, connect: Connect) -> None:
         self.complete, self.n_damaged, self._connect = False, 0, connect
-        self._types: dict[int, tuple[str, str]] = {}    # names and definitions
+        self._types: dict[int, tuple[str, str]] = {}    # names and definitions, of mcap
         self._topics: dict[int, Connection] = {}
         with path.open('rb') as file:
             self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.close = self._file.close
+
+
+class _Mcap(_Walked):
+    """An mcap file, cut short or with damaged bytes."""
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages."""
@@ -198,15 +202,8 @@ class _Sqlite:
         self.complete = self.n_damaged == 0
 
 
-class _Ros1:
+class _Ros1(_Walked):
     """A bag of ROS 1, cut short or with damaged bytes."""
-
-    def __init__(self, path: Path, connect: Connect) -> None:
-        self.complete, self.n_damaged, self._connect = False, 0, connect
-        self._topics: dict[int, Connection] = {}
-        with path.open('rb') as file:
-            self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        self.close = self._file.close
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages."""

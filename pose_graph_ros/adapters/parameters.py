@@ -283,7 +283,7 @@ def as_yaml() -> str:
         # the same one is not repeated
         lines += [] if comment in lines else [comment]
         lines.append(f'{indent}# {leaf}: {_EXAMPLES[leaf]}' if parameter.default == [] else
-                     f'{indent}{leaf}: {_yaml(parameter.default)}')
+                     f'{indent}{leaf}: {yaml_text_of(parameter.default)}')
     return '\n'.join(lines) + '\n'
 
 
@@ -305,7 +305,7 @@ def as_markdown() -> str:
 def _facts(parameter: Parameter) -> str:
     """Return the columns from the default on."""
     value = '' if parameter.name in ('type', 'topic') else (
-        'unset' if parameter.default == [] else _yaml(parameter.default))
+        'unset' if parameter.default == [] else yaml_text_of(parameter.default))
     return (f'{value} | {parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
             f'{parameter.description} |')
 
@@ -325,8 +325,10 @@ def constraints(parameter: Parameter) -> str:
         'configured' if parameter.change is Change.UNCONFIGURED else '')))
 
 
-def _yaml(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f'[{", ".join(map(_yaml, value))}]' if isinstance(value, list) else (
-        value if isinstance(value, str) and value != '' else repr(value))
+def yaml_text_of(value: Value) -> str:
+    """Return the value of a parameter as YAML."""
+    if isinstance(value, list | tuple):
+        return f'[{", ".join(map(yaml_text_of, value))}]'
+    text = value if isinstance(value, str) and value != '' else repr(value)
+    return text.lower() if isinstance(value, bool) else (   # YAML takes 1e-05 for a text
+        text.replace('e', '.0e') if isinstance(value, float) and '.' not in text else text)

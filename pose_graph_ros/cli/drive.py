@@ -19,26 +19,16 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, reader_of
+from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, read_inputs, reader_of
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY
 from pose_graph_ros.cli.truth import Heighted, path_of, Truth, UNKNOWN
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Fix,
-    GlobalPose,
-    LoopClosure,
-    Measurement,
-    OdometrySample,
-    Position,
-    rejected,
-)
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline import noise
 
@@ -238,7 +228,7 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
             'errors': [asdict(row) for row in drive.rows], **extra}
 
 
-Measured = tuple[str, OdometrySample | Measurement, bool]
+Measured = tuple[str, ms.OdometrySample | ms.Measurement, bool]
 """A measurement after its source, and whether it is kept out of the graph."""
 
 
@@ -250,25 +240,25 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
     The height of each pose of the first odometry is added to the heights, NaN if it has no pose.
     """
     start_ns: StampNs | None = None
-    for source, message, is_held_out in bags.read_inputs(bag, inputs):
+    for source, message, is_held_out in read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
         try:
             content = message.decode()
             measurement = reader.read(source, content)
         except MessageError:
-            measurement = rejected('malformed', '')
-        if isinstance(measurement, Answer):
+            measurement = ms.rejected('malformed', '')
+        if isinstance(measurement, ms.Answer):
             refused[source, measurement.reason] += 1
             continue
-        if isinstance(measurement, OdometrySample):
+        if isinstance(measurement, ms.OdometrySample):
             start_ns = measurement.stamp_ns if start_ns is None else start_ns
             if heights is not None and source == inputs.odometry[0]:
                 heights.append(content.pose.pose.position.z
                                if inputs.kinds[source] is ODOMETRY else np.nan)
         is_in_stretch = (
             inputs.stretch is not None and start_ns is not None
-            and isinstance(measurement, Fix | GlobalPose | Position) and noise.is_in_part(
+            and isinstance(measurement, ms.Fix | ms.GlobalPose | ms.Position) and noise.is_in_part(
                 measurement.stamp_ns, start_ns, inputs.stretch, inputs.hold_out - 1,
                 inputs.hold_out))
         if held_out or not is_in_stretch:
@@ -311,29 +301,29 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
     corrected = estimate.path
     loops, sources, held = list[Key](), list[str](), list[bool]()
     odometry = array('q'), array('d')
-    fixes = list[Fix | GlobalPose | Position]()
+    fixes = list[ms.Fix | ms.GlobalPose | ms.Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
-            case Fix() | GlobalPose() | Position():
+            case ms.Fix() | ms.GlobalPose() | ms.Position():
                 fixes.append(measurement)
                 sources.append(source)
                 held.append(held_out)
-            case LoopClosure(stamp, _, _, int(reference)):
+            case ms.LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
-            case OdometrySample(stamp, pose) if source == odometry_source:
+            case ms.OdometrySample(stamp, pose) if source == odometry_source:
                 odometry[0].append(stamp)
                 odometry[1].extend(pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    arms = np.array([np.zeros(2) if isinstance(each, GlobalPose) else each.lever_arm
+    arms = np.array([np.zeros(2) if isinstance(each, ms.GlobalPose) else each.lever_arm
                      for each in fixes]).reshape(-1, 2)
     inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
     # a fix that can have been used makes the datum, if there is none
     for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
         each = fixes[k]
-        positions[k] = each.placed().position if isinstance(each, Fix) else (
-            each.pose[:2] if isinstance(each, GlobalPose) else each.position)
+        positions[k] = each.placed().position if isinstance(each, ms.Fix) else (
+            each.pose[:2] if isinstance(each, ms.GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])

@@ -5,7 +5,7 @@
 import argparse
 from pathlib import Path
 
-from pose_graph_ros.cli.migration import files, text
+from pose_graph_ros.cli.migration import inputs, text
 from pose_graph_ros.cli.migration.engine import Migration
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -16,7 +16,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if options.out is not None and options.out.exists() and not options.force:
         raise ConfigError(f'{options.out}: exists already, not overwritten without --force')
-    migration = Migration(files.read(options.files), replaces_local=options.replace_local)
+    migration = Migration(inputs.read(options.files), replaces_local=options.replace_local)
     words = [str(each) for each in options.files]
     content = text.parameter_file(migration, options.out or UNNAMED, words)
     if options.out is None:

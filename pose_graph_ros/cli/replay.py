@@ -26,13 +26,7 @@ from pose_graph_ros.adapters.conversions import Datum, frame
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, FULL, ON_EARTH
-from pose_graph_ros.cli.drive import (
-    collect_drive,
-    Drive,
-    drive_in,
-    measured_in,
-    with_truth,
-)
+from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in, with_truth
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
 from pose_graph_ros.cli.truth import truth_of

@@ -22,8 +22,7 @@ import numpy as np
 
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
-from pose_graph_ros.cli.graph_input import read_file, rows_of
-from pose_graph_ros.cli.solved import solved_graph
+from pose_graph_ros.cli.graph_input import read_file, rows_of, solved_graph
 from pose_graph_ros.core import config, sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph

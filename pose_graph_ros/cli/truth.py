@@ -15,14 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters import bags
-from pose_graph_ros.adapters.bags import Bag, BagError
+from pose_graph_ros.adapters.bags import Bag, BagError, Span, WHOLE
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, ODOMETRY
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import compose, FloatArray
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.io.path_files import PathFile, read_path, seconds_text
 from pose_graph_ros.core.measurements import Answer
@@ -45,7 +43,7 @@ class Truth(NamedTuple):
     content: PathFile | None = None
     is_aligned: bool = True
 
-    def read(self, bag: Bag | None, span: bags.Span = bags.WHOLE,
+    def read(self, bag: Bag | None, span: Span = WHOLE,
              plane: TangentPlane | None = None) -> Heighted | None:
         """Return the true poses, if known, in the map of a plane if they are on the Earth."""
         if self.content is None:
@@ -72,7 +70,7 @@ class Truth(NamedTuple):
         if not self.is_aligned:
             return truth, None
         pose = fit_motion(truth.poses[inside, :2], path.at(truth.stamps_ns[inside])[:, :2])
-        placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
+        placed = Trajectory(truth.stamps_ns, compose(pose, truth.poses))
         return placed, abs(float(pose[2]))
 
 
@@ -86,7 +84,7 @@ def truth_of(options: argparse.Namespace) -> Truth:
         given, is_aligned=is_aligned)
 
 
-def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Heighted:
+def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Heighted:
     """
     Return the true poses that were recorded in a span; invalid messages are ignored.
 

@@ -34,8 +34,7 @@ from pose_graph_ros.cli.truth import truth_of
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
 from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
+from pose_graph_ros.core.geometry.se2 import between, Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
@@ -289,7 +288,7 @@ class Tuning:
         inside = np.all(path.covers(stamps), axis=1)
         ends = path.at(stamps[inside])
         poses = np.array([each.pose for each in closures]).reshape(-1, 3)[inside]
-        errors = poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        errors = poses[:, :2] - between(ends[:, 0], ends[:, 1])[:, :2]
         # the covariances of these are not known
         return [*found, Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))]
 

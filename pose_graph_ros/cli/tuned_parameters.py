@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import math
 from typing import Any, NamedTuple
 
+from pose_graph_ros.adapters.parameters import yaml_text_of
 from pose_graph_ros.adapters.sources import Values
 from pose_graph_ros.core.quantities import Metres, Radians
 from pose_graph_ros.offline.noise import Found
@@ -118,11 +119,11 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
         for each in own:
             leaf = each.name.partition('.')[2]
             if each.changes:
-                lines += [f'      # {_text(each.before)} before; {_why(each)}',
-                          f'      {leaf}: {_text(each.after)}']
+                lines += [f'      # {yaml_text_of(each.before)} before; {_why(each)}',
+                          f'      {leaf}: {yaml_text_of(each.after)}']
             else:
                 name = f'      # {leaf}' if some_change else f'    # {each.name}'
-                lines.append(f'{name}: {_text(each.before)}, {_why(each)}')
+                lines.append(f'{name}: {yaml_text_of(each.before)}, {_why(each)}')
     return '\n'.join(lines) + '\n'
 
 
@@ -138,13 +139,3 @@ def _why(tuned: Tuned) -> str:
 
 def _number(value: float) -> str:
     return 'no bound' if math.isinf(value) else f'{value:.3g}'
-
-
-def _text(value: Any) -> str:
-    """Return a value as YAML, numbers as floating-point ones."""
-    if isinstance(value, list | tuple):
-        return f'[{", ".join(_text(each) for each in value)}]'
-    if not isinstance(value, int | float):
-        return str(value)
-    text = repr(float(value))   # YAML takes 1e-05 for a text
-    return text.replace('e', '.0e') if 'e' in text and '.' not in text else text

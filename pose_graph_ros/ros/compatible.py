@@ -9,6 +9,7 @@ coordinates are NaN, as a robot would drive to 0.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
 import logging
 import math
@@ -49,13 +50,14 @@ class Compatible(Services):
             return
         self._offer(types.SetPose, 'set_pose', self._set_pose)
         self._offer(types.ToggleFilterProcessing, 'toggle', self._toggle)
-        self._offer(types.ToLL, 'toLL', self._to_ll)
-        self._offer(types.FromLL, 'fromLL', self._from_ll)
         self._offer(types.SetDatum, 'datum', self._give_datum, waits=True)
-        # older versions of robot_localization do not have these
-        for name, act in (('ToLLArray', self._to_lls), ('FromLLArray', self._from_lls)):
-            if hasattr(types, name):
-                self._offer(getattr(types, name), f'{name[0].lower()}{name[1:]}', act, waits=True)
+        for name, convert, given, found in (('ToLL', self._on_earth, 'map_point', 'll_point'),
+                                            ('FromLL', self._in_map, 'll_point', 'map_point')):
+            # older versions of robot_localization do not have arrays
+            for kind, plural in ((name, ''), (f'{name}Array', 's')):
+                if hasattr(types, kind):
+                    self._offer(getattr(types, kind), kind[0].lower() + kind[1:], partial(
+                        _converted, convert, given + plural, found + plural), waits=plural != '')
 
     def _offer(self, kind: Any, name: str, act: Act, *, waits: bool = False) -> None:
         """Create a service, in the thread of those that wait if it does."""
@@ -94,22 +96,6 @@ class Compatible(Services):
             return False, f'refused: {error}'
         return True, f'the datum is {given}'
 
-    def _to_ll(self, request: Any, response: Any) -> Answer:
-        (response.ll_point,), answer = self._on_earth([request.map_point])
-        return answer
-
-    def _to_lls(self, request: Any, response: Any) -> Answer:
-        response.ll_points, answer = self._on_earth(request.map_points)
-        return answer
-
-    def _from_ll(self, request: Any, response: Any) -> Answer:
-        (response.map_point,), answer = self._in_map([request.ll_point])
-        return answer
-
-    def _from_lls(self, request: Any, response: Any) -> Answer:
-        response.map_points, answer = self._in_map(request.ll_points)
-        return answer
-
     def _on_earth(self, points: Sequence[Any]) -> tuple[list[Any], Answer]:
         """Return points of the map on the Earth, at the altitude that `gps/filtered` has."""
         datum = self._session.input.reader.datum
@@ -140,3 +126,12 @@ class Compatible(Services):
         # the height is 0, or NaN as the rest
         return [Point(x=x, y=y, z=0.0 if math.isfinite(x) else x)
                 for x, y in found.tolist()], answer
+
+
+def _converted(convert: Callable[[Sequence[Any]], tuple[list[Any], Answer]], given: str,
+               found: str, request: Any, response: Any) -> Answer:
+    """Convert the point, or the points, of a request."""
+    points = getattr(request, given)
+    converted, answer = convert(points if isinstance(points, Sequence) else [points])
+    setattr(response, found, converted if isinstance(points, Sequence) else converted[0])
+    return answer

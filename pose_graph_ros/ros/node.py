@@ -17,7 +17,7 @@ from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETER
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros import compatible, log, services, session, topics
-from pose_graph_ros.ros.graph_folder import with_folder
+from pose_graph_ros.ros.stored_graphs import with_folder
 
 logger = logging.getLogger(__name__)
 

@@ -23,10 +23,9 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
 from pose_graph_ros.core.io.graph_files import SavedGraph, site_refusal, write_graph
-from pose_graph_ros.ros.graph_folder import graph_path
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.spinning import Spinner
-from pose_graph_ros.ros.stored_graphs import restored
+from pose_graph_ros.ros.stored_graphs import graph_path, restored
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)

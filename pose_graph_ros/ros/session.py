@@ -22,14 +22,9 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from pose_graph_ros.adapters import sources as kinds
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import (
-    backend_config,
-    CLOCK_JUMP_NS,
-    MessageReader,
-    SET_POSE,
-    Source,
-)
+from pose_graph_ros.adapters.sources import backend_config, MessageReader, Source
 from pose_graph_ros.core import measurements, quantities
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
@@ -275,7 +270,7 @@ class Session:
         answer = PAUSED if self.input.paused else self._set_pose_input.receive(
             message, early=self.worker.estimate is None)
         if answer is not None:
-            self.input.reject(SET_POSE, answer)
+            self.input.reject(kinds.SET_POSE, answer)
             logger.warning(
                 'the pose is not set: %s: %s', answer.reason, answer.detail, extra=log.ANSWER)
         # of more than a person sets the newest is taken with the next update
@@ -301,7 +296,7 @@ class Session:
         if self._jump_handle is None:
             self._jump_handle = self.node.get_clock().create_jump_callback(
                 JumpThreshold(min_forward=None, on_clock_change=False,
-                              min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS)),
+                              min_backward=Duration(nanoseconds=-kinds.CLOCK_JUMP_NS)),
                 post_callback=spinning.guarded(self._on_clock_jump, lambda: self.active))
 
     def _on_clock_jump(self, jump: TimeJump) -> None:

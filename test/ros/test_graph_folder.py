@@ -12,7 +12,7 @@ from saved_graphs import straight_line
 
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, FileWriteError
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.ros.graph_folder import graph_path, with_folder
+from pose_graph_ros.ros.stored_graphs import graph_path, with_folder
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 """
 From parameter files of robot_localization, fuse and slam_toolbox to one of this node.
 
-`files` reads them, `tables` says what becomes of each of their parameters, `inputs` which source
-an input becomes, `engine` puts that together, `steps` says what is left to do, and `text` writes
-it down. Read `tables` first: to know one more parameter is one more row there.
+`inputs` reads them, and says which source an input becomes, `rules` what becomes of each of their
+parameters, `engine` puts that together, and `text` writes it down, with what is left to do. To
+know one more parameter is one more row in rules.yaml.
 """

@@ -14,18 +14,15 @@ from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters import parameters
 from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES
-from pose_graph_ros.cli.migration import inputs as of, tables
-from pose_graph_ros.cli.migration.files import in_map, place, Section, System
-from pose_graph_ros.cli.migration.inputs import Input, PLANAR
-from pose_graph_ros.cli.migration.tables import Fate, Rule
+from pose_graph_ros.cli.migration import inputs as of
+from pose_graph_ros.cli.migration.inputs import in_map, Input, place, PLANAR, Section, System
+from pose_graph_ros.cli.migration.rules import CONVERSIONS, Fate, Rule, rule_of, TABLES
 from pose_graph_ros.core.exceptions import ConfigError
 
 USUAL_NAMES = {kind.name: name for name, (kind, _) in KNOWN_SOURCES.items()}
 ANGLES = ('yaw_offset', 'magnetic_declination_radians')  # their sum turns a compass to the east
 LOCAL, ALONE, GLOBAL = 'odometry/local', 'odometry/filtered', 'odometry/global'
 """Outputs of filters, as launch files of robot_localization and Nav2 name them."""
-RULES = {System.FILTER: tables.FILTER, System.NAVSAT: tables.NAVSAT, System.FUSE: tables.FUSE,
-         System.SLAM_TOOLBOX: tables.SLAM_TOOLBOX}
 
 
 class Entry(NamedTuple):
@@ -186,8 +183,8 @@ class Migration:
                 else:
                     names = self.names[one]
                     source = next(iter(names.values()), '')
-                    rule = tables.rule_of(
-                        tables.INPUT_OF_FUSE if len(plugins) > 0 else tables.INPUT,
+                    rule = rule_of(
+                        'input_of_fuse' if len(plugins) > 0 else 'input',
                         f'{"+".join(names) or "none"}:{name[len(one.name) + 1:]}', value)
                 self._apply(section, name, value, rule, source)
 
@@ -227,14 +224,14 @@ class Migration:
 
     def _apply(self, section: Section, name: str, value: Any, rule: Rule, source: str) -> None:
         """Note what a row of a table says of a parameter, and take its value if it says so."""
-        fate, sentence = rule.fate, rule.sentence
+        fate, sentence = Fate[rule.fate.upper()], rule.why
         if (target := rule.target.replace('*', source, 1)) != '':
             types = {each: own.value for each, own in self.settings.items()
                      if each == 'sources' or each.endswith('.type')}
             own = {each.name: each for each in parameters.all_parameters(types)}.get(target)
             try:
                 self._set(target, value if '$(' in str(value) or own is None else
-                          parameters.checked_value(own, rule.convert(value)),
+                          parameters.checked_value(own, CONVERSIONS[rule.convert](value)),
                           place(section, name))
                 sentence = '; '.join(filter(None, (target if target != name else '', sentence)))
             except (ConfigError, ArithmeticError, LookupError, TypeError, ValueError):
@@ -250,6 +247,6 @@ def _rule(system: System, plugins: dict[str, str], name: str, value: Any) -> Rul
     model = re.fullmatch(r'(?:sensor_models|publishers)\.(.+)\.type', name)
     if (owner := model[1] if model else next(
             (each for each in plugins if name.startswith(f'{each}.')), '')) == '':
-        return tables.rule_of(RULES[system], name, value)
-    return tables.rule_of(tables.PLUGINS.get(plugins[owner], tables.UNKNOWN_PLUGIN),
-                          'type' if model else name.removeprefix(f'{owner}.'), value)
+        return rule_of(system.name.lower(), name, value)
+    return rule_of(plugins[owner] if plugins[owner] in TABLES else 'unknown_plugin',
+                   'type' if model else name.removeprefix(f'{owner}.'), value)

@@ -244,18 +244,23 @@ function pathRamps() {
   return Object.fromEntries(Object.entries(found).filter(([, ramp]) => ramp));
 }
 
-/** A value at a time, between those before and after it; null outside. */
-function valueAt(times, column, time) {
+/** The rows before and after a time, and which part of the way from one to the other it is. */
+function around(times, time) {
   let [low, high] = [0, times.length - 1];
-  if (!(time >= times[low] && time <= times[high])) return null;
   while (high - low > 1) {
     const middle = (low + high) >> 1;
     if (times[middle] <= time) low = middle;
     else high = middle;
   }
-  const part = times[high] > times[low] ? (time - times[low]) / (times[high] - times[low]) : 0;
-  return known(column[low]) && known(column[high])
-    ? column[low] + part * (column[high] - column[low]) : null;
+  const part = (time - times[low]) / (times[high] - times[low] || 1);
+  return [low, high, Math.min(1, Math.max(0, part))];
+}
+
+/** A value at a time, between those before and after it; null outside. */
+function valueAt(times, column, time) {
+  if (!(time >= times[0] && time <= times[times.length - 1])) return null;
+  const [k, m, part] = around(times, time);
+  return known(column[k]) && known(column[m]) ? column[k] + part * (column[m] - column[k]) : null;
 }
 
 const middleOf = (ends) => [0, 1].map(
@@ -391,9 +396,7 @@ function placeText([x, y]) {
 
 /** Where the robot was at a time, between two poses of the path. */
 function poseAt({t, x, y, theta}, time) {
-  const after = t.findIndex((each) => each >= time);
-  const [k, m] = after < 0 ? [t.length - 1, t.length - 1] : [Math.max(after - 1, 0), after];
-  const part = t[m] > t[k] ? Math.max(0, (time - t[k]) / (t[m] - t[k])) : 0;
+  const [k, m, part] = around(t, time);
   const between = (column) => column[k] + part * (column[m] - column[k]);
   return {x: between(x), y: between(y), theta: theta ? theta[part < 0.5 ? k : m] : null};
 }
@@ -445,19 +448,11 @@ function factsOf({source, ends, times, tie, distance, spring}) {
   if (tie) rows.push(['off the path', apart(tie, ends[0])]);
   if (known(distance)) rows.push(['distance', `${number(distance)} sigma`]);
   if (!spring) return rows;
-  const {rank, kind, energy, expected, residual, sigma} = spring;
+  const {rank, kind, energy, expected} = spring;
   rows.push(['rank', `${rank} of ${DATA.springs.length}`]);
   if (kind === 'difference') return rows;
   rows.push(['kind', kind],
     ['energy', `${number(energy)}, where ${number(expected)} is expected`]);
-  const names = ['position', 'fix', 'global pose'].includes(kind) ? ['x', 'y', 'heading']
-    : ['along', 'across', 'heading'];
-  for (const [k, name] of names.entries()) {
-    // coordinates without a sigma say nothing
-    if (!residual || !sigma || !known(residual[k]) || !(sigma[k] > 0)) continue;
-    const value = name === 'heading' ? `${number(degrees(residual[k]))}°` : length(residual[k]);
-    rows.push([name, `${value}, ${number(residual[k] / sigma[k], 2)} sigma`]);
-  }
   return rows;
 }
 

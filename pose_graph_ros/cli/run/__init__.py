@@ -142,6 +142,11 @@ class Frame:
         moved = np.asarray(points).reshape(-1, 2) - self.offset
         return rounded(moved[:, 0], digits), rounded(moved[:, 1], digits)
 
+    def place(self, stamp_ns: StampNs, position: FloatArray) -> dict[str, float]:
+        """Return time and place of a point."""
+        (x,), (y,) = self.places(position[:2])
+        return {'t': self.seconds(np.array([stamp_ns]))[0], 'x': x, 'y': y}
+
     def text(self, text: str) -> int:
         """Return the number of a text; -1 for an empty one."""
         return -1 if text == '' else self.texts.setdefault(text, len(self.texts))

@@ -21,8 +21,7 @@ from pose_graph_ros.cli.run import Frame, number, rounded
 from pose_graph_ros.cli.run.document import read_document, VERSION
 from pose_graph_ros.cli.run.findings import Finding, in_order, MOST_SHOWN
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, transform, wrap
 from pose_graph_ros.core.geometry.trajectory import fit_motion
 from pose_graph_ros.core.judgement.texts import short
 
@@ -97,8 +96,8 @@ def _apart(a: FloatArray, b: FloatArray) -> Apart | None:
     places = np.array((here[1:3].T, np.column_stack((x, y))))
     distance = np.hypot(*(places[1] - places[0]).T)
     motion = fit_motion(places[1], places[0])
-    after = np.hypot(*(se2.transform(motion, places[1]) - places[0]).T)
-    return Apart(here[0], places, distance, se2.wrap(theta - here[3]), _rms(distance), motion,
+    after = np.hypot(*(transform(motion, places[1]) - places[0]).T)
+    return Apart(here[0], places, distance, wrap(theta - here[3]), _rms(distance), motion,
                  _rms(after))
 
 

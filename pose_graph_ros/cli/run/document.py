@@ -23,8 +23,7 @@ from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariances, IntArray, wrap
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.path_files import write_tum
@@ -353,7 +352,7 @@ def _errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, A
     at = np.clip(np.searchsorted(path.stamps_ns, stamps), 0, len(path) - 1)
     return {'against': against, 't': frame.seconds(stamps), 'position': rounded(far),
             'heading': None if truth is None else rounded(
-                se2.wrap(path.at(stamps)[:, 2] - places[:, 2]), 4),
+                wrap(path.at(stamps)[:, 2] - places[:, 2]), 4),
             'sigma': None if not np.any(np.isfinite(sigma)) else rounded(sigma[at]),
             'odometry': rounded(by_odometry)}
 

@@ -16,12 +16,11 @@ import numpy as np
 
 from pose_graph_ros.adapters import sources as kinds
 from pose_graph_ros.cli import drive as drives, solve
-from pose_graph_ros.cli.graph_input import read_file
+from pose_graph_ros.cli.graph_input import read_file, solved_graph, SolvedGraph
 from pose_graph_ros.cli.run import document, findings, Frame, number, rounded
 from pose_graph_ros.cli.run.document import Told
 from pose_graph_ros.cli.run.findings import Finding, MANY, MOST_SHOWN
 from pose_graph_ros.cli.run.sources import source_entry, SourceAnalysis, verdict
-from pose_graph_ros.cli.solved import solved_graph, SolvedGraph
 from pose_graph_ros.core.batch.optimizer import optimize, Status
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -199,18 +198,14 @@ def _springs(solved: SolvedGraph, times: IntArray, rows: dict[str, IntArray],  #
         known = np.isfinite(redundancies := each.residuals.redundancies)
         expected[each.residuals.ids[known]] = redundancies[known]
 
-    def place(time: IntArray, point: FloatArray) -> dict[str, float]:
-        (x,), (y,) = frame.places(point[:2])
-        return {'t': frame.seconds(time)[0], 'x': x, 'y': y}
-
     for row in np.argsort(-energies, kind='stable')[:10].tolist():
         name = next(name for name, every in rows.items() if row in every)
         springs.append({
             'rank': len(springs) + 1, 'source': name, 'name': told[row].id,
             'kind': FactorKind(factors.kind[row]).name.lower().replace('_', ' '),
             'energy': number(energies[row]), 'expected': number(expected[row]),
-            'from': place(times[row, :1], solved.after[factors.i[row]]),
-            'to': place(times[row, 1:], factors.mean[row] if name == 'observed'
-                        else solved.after[factors.j[row]]),
+            'from': frame.place(times[row, 0], solved.after[factors.i[row]]),
+            'to': frame.place(times[row, 1], factors.mean[row] if name == 'observed'
+                              else solved.after[factors.j[row]]),
             'text': f'{name}: {short(solved.off[row], 3)} sigma off'})
     return springs

@@ -12,7 +12,6 @@ from pose_graph_ros.cli.run import Frame, number, rounded, Run
 from pose_graph_ros.core.disagreement import ConstraintEnergy
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
-from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.offline import source_residuals, variance_components
 from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, Whiteness
@@ -157,10 +156,6 @@ def springs(run: Run, analyses: dict[str, SourceAnalysis], frame: Frame) -> list
     names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
 
-    def place(stamp_ns: StampNs, position: FloatArray) -> dict[str, float]:
-        x, y = frame.places(position)
-        return {'t': frame.seconds(np.array([stamp_ns]))[0], 'x': x[0], 'y': y[0]}
-
     for rank, each in enumerate(run.backend.largest_energies(10), 1):
         residual, expected = None, math.nan
         source = analyses.get(each.source)
@@ -168,16 +163,16 @@ def springs(run: Run, analyses: dict[str, SourceAnalysis], frame: Frame) -> list
         if source is not None and np.count_nonzero(at) == 1:
             one = source.residuals.rows(at)
             residual, expected = one.errors[0], float(one.redundancies[0])
-        ends = [place(stamps[node], path.poses[node, :2]) for node in each.nodes
+        ends = [frame.place(stamps[node], path.poses[node]) for node in each.nodes
                 if node < len(path)]
         here = ends[:1]
         if len(ends) == 0 and each.stamp_ns >= 0 and path.covers(each.stamp_ns):
             # a bias is shown where the robot was
-            ends = here = [place(each.stamp_ns, path.at(each.stamp_ns)[:2])]
+            ends = here = [frame.place(each.stamp_ns, path.at(each.stamp_ns))]
         elif len(ends) == 1 and residual is not None and each.kind != 'heading':
             # from where the estimate has it to where it was measured
             node = each.nodes[0]
-            ends = [*ends, place(stamps[node], path.poses[node, :2] + residual[:2])]
+            ends = [*ends, frame.place(stamps[node], path.poses[node, :2] + residual[:2])]
         name = each.name
         if each.stamp_ns >= 0:  # with the time since the start of the drive
             what, _, rest = name.partition(' at ')

@@ -20,17 +20,9 @@ import threading
 import time
 from typing import Any
 
+from pose_graph_ros.core.io import journal_file as jf
 from pose_graph_ros.core.io.graph_files import SavedGraph
-from pose_graph_ros.core.io.journal_file import (
-    Batch,
-    Checkpoint,
-    Entry,
-    Found,
-    JournalFile,
-    KnownPath,
-    Measured,
-    plain,
-)
+from pose_graph_ros.core.io.journal_file import Batch, Checkpoint, Entry, Found, KnownPath
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +44,7 @@ class Chapter:
         self.taken = self._posted = self._acts = 0
         self._is_changed, self._cost, self._checked_at = True, 0.0, time.monotonic()
 
-    def measured(self, source: str, measurement: Measured) -> None:
+    def measured(self, source: str, measurement: jf.Measured) -> None:
         """Note a measurement that is handed to the engine."""
         self._posted, self._is_changed = self._posted + 1, True
         self._journal.put(self, Entry(self._posted, 0, source, measurement))
@@ -78,11 +70,11 @@ class Chapter:
         """Begin to copy the state: the next one is not due soon, also if this one fails."""
         self._checked_at = time.monotonic()
 
-    def checkpoint(self, saved: SavedGraph, pending: Sequence[tuple[str, Measured]]) -> None:
+    def checkpoint(self, saved: SavedGraph, pending: Sequence[tuple[str, jf.Measured]]) -> None:
         """Note the state of the engine, in whose thread it was copied."""
         self._is_changed, self._cost = False, time.monotonic() - self._checked_at
-        self._journal.put(self, Checkpoint(
-            saved, [(source, plain(each)) for source, each in pending], (self.taken, self._acts)))
+        waiting = [(source, jf.plain(each)) for source, each in pending]
+        self._journal.put(self, Checkpoint(saved, waiting, (self.taken, self._acts)))
 
 
 Item = tuple[float, Chapter, Any, threading.Event | None]
@@ -103,7 +95,7 @@ class Journal:
                  refusal: Callable[[SavedGraph], str | None] = lambda _: None) -> None:
         self._found = Future[Found]()
         self.failure, self.lag, self.has_gap = '', 0.0, False
-        self._file, self._period, self._refusal = JournalFile(path), period, refusal
+        self._file, self._period, self._refusal = jf.JournalFile(path), period, refusal
         self._items = deque[Item]()
         self._condition = threading.Condition()
         self._is_wanted = self._closing = False
@@ -229,7 +221,7 @@ class Journal:
                     number=number + item.number, act=act + item.act))
             else:
                 batch.entries.append(item._replace(
-                    number=number + item.number, values=plain(item.values)))
+                    number=number + item.number, values=jf.plain(item.values)))
         return batch
 
     def _write(self, batch: Batch) -> None:
