@@ -4,65 +4,49 @@
 The command `pose-graph` with the tools around the node.
 
 A tool is the module of this package with its name, whose `execute` is called. It is imported when
-its arguments are known to be right, as the imports take up to seconds; what these arguments are is
-told by a function with its name in `arguments`, of `simulate` in `simulation_options`.
+its arguments are known to be right, as the imports take up to seconds.
 """
 
 import argparse
 from collections.abc import Callable
 import gc
 import importlib
+import inspect
 import os
 import signal
 import sys
-import textwrap
 import threading
 from types import FrameType
 
 from pose_graph_ros import __version__
+from pose_graph_ros.cli import arguments, simulation_options
 from pose_graph_ros.core.exceptions import PoseGraphError
 
-SUMMARIES = {
-    'demo': 'play a bag to the node over DDS',
-    'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
-    'solve': 'optimise a g2o file',
-    'report': 'make one HTML page of a run: map, errors, residuals, what is doubted',
-    'draw': 'draw a small graph as SVG or PNG',
-    'marginalize': 'take nodes out of a graph, and keep what they told',
-    'tune': 'estimate the noise of the sources from bags; write a parameter file',
-    'migrate': 'make a parameter file of those of robot_localization, fuse, slam_toolbox',
-    'simulate': 'write a simulated drive as a rosbag2 or a graph',
-    'parameters': 'print the parameters of the node',
-    'compile-kernels': 'compile the solver for later starts'}
-"""Tools and what they do."""
+TOOLS = {declare.__name__.replace('_', '-'): declare for declare in (
+    arguments.demo, arguments.replay, arguments.solve, arguments.report, arguments.draw,
+    arguments.marginalize, arguments.tune, arguments.migrate, simulation_options.simulate,
+    arguments.parameters, arguments.compile_kernels)}
+"""Tools and what adds their arguments, whose docstrings say what they do."""
 RETRY = 0.01  # after which an interrupt is tried again [s]
 
 
 def main(args: list[str] | None = None) -> int:
     """Run a tool with command line arguments; return the exit code."""
-    words = sys.argv[1:] if args is None else args
     parser = argparse.ArgumentParser(
         prog='pose-graph', description='Tools around the pose graph node.')
     parser.add_argument('--version', action='version', version=__version__)
-    tools = parser.add_subparsers(title='tools', required=True)
-    parsers = {name: tools.add_parser(name, help=text) for name, text in SUMMARIES.items()}
-    # no option before the tool's name has a value
-    chosen = next((word for word in words if not word.startswith('-')), '')
+    tools = parser.add_subparsers(title='tools', required=True, dest='tool')
+    for name, declare in TOOLS.items():
+        # the description, the arguments and, behind these, the examples
+        text, examples, rest = inspect.cleandoc(declare.__doc__ or '').partition('examples:')
+        summary = text.partition('\n')[0].removesuffix('.')
+        declare(tools.add_parser(
+            name, help=summary[0].lower() + summary[1:], description=text, epilog=examples + rest,
+            formatter_class=argparse.RawDescriptionHelpFormatter))
 
     def run() -> int:
-        if chosen in parsers:
-            # the description, the arguments and, behind these, the examples
-            tool, name = parsers[chosen], (
-                'simulation_options' if chosen == 'simulate' else 'arguments')
-            declare = getattr(importlib.import_module(f'pose_graph_ros.cli.{name}'),
-                              chosen.replace('-', '_'))
-            tool.description, examples, rest = textwrap.dedent(
-                declare.__doc__).strip().partition('examples:')
-            tool.epilog = examples + rest
-            tool.formatter_class = argparse.RawDescriptionHelpFormatter
-            declare(tool)
-        options = parser.parse_args(words)
-        module = importlib.import_module(f'pose_graph_ros.cli.{chosen.replace("-", "_")}')
+        options = parser.parse_args(args)
+        module = importlib.import_module(f'pose_graph_ros.cli.{options.tool.replace("-", "_")}')
         return int(module.execute(options))
     return guarded(run)
 

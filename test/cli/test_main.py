@@ -10,11 +10,10 @@ import pytest
 
 from pose_graph_ros import __version__
 from pose_graph_ros.adapters.parameters import as_markdown, as_yaml
-from pose_graph_ros.cli.main import main, SUMMARIES
+from pose_graph_ros.cli.main import main, TOOLS
 from pose_graph_ros.core import backend  # noqa: F401  declares the kernels
 from pose_graph_ros.core.compiled import jit
 
-TOOLS = tuple(SUMMARIES)
 RING = Path(__file__).parents[1] / 'data' / 'ring.g2o'
 # What only some tools need, and what takes a tenth of a second or more to import.
 HEAVY = ('rclpy', 'rosbags', 'pyproj', 'matplotlib', 'PIL', 'scipy', 'numba', 'numpy', 'yaml')
