@@ -360,8 +360,6 @@ def choose_inputs(reader: Bag, sources: Sequence[Source], wanted: Mapping[str, s
     return inputs
 
 
-
-
 def _guess(reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str], *,
            asked: bool, truth: str | None) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""

@@ -121,8 +121,6 @@ def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:
                      first[-56:], rows[1:].tobytes()))
 
 
-
-
 class Look(NamedTuple):
     """Colours (red, green, blue, alpha) and sizes [m] of the markers of the graph."""
 

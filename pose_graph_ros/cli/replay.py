@@ -106,8 +106,6 @@ def write_lines(path: Path, lines: Iterator[str]) -> None:
         file.writelines(f'{line}\n' for line in lines)
 
 
-
-
 class _Corrector:
     """Makes what is published with each message of the primary odometry."""
 

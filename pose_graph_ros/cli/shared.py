@@ -41,8 +41,6 @@ def parameter_values(options: argparse.Namespace, usual: Values | None = None) -
     return checked(given)
 
 
-
-
 def ros_arguments(options: argparse.Namespace) -> list[str]:
     """Return the command line arguments that give the node the same parameters."""
     file = options.params_file

@@ -394,5 +394,3 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return '[' + ', '.join(map(_value, value)) + ']' if len(value) > 0 else 'unset'
     return f'{value:.4g}' if isinstance(value, int | float) else str(value)
-
-

@@ -446,4 +446,3 @@ def _read_state(connection: sqlite3.Connection) -> Checkpoint | None:
 def _check(digest: bytes, content: bytes) -> None:
     if _digest(content) != digest:
         raise FileFormatError('a row does not have its SHA-256')
-

@@ -275,8 +275,6 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     return heading, np.round(stops / CIRCUIT_STEP).astype(np.int64), lap_length
 
 
-
-
 def _hall(generator: Generator, duration_s: float) -> Motion:
     """
     Return a drive through the aisles of a hall in random order.
