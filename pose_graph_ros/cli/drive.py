@@ -21,7 +21,7 @@ from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters.bags import Bag, Inputs, MessageError, read_inputs, reader_of
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY
-from pose_graph_ros.cli.truth import Heighted, path_of, Truth, UNKNOWN
+from pose_graph_ros.cli.truth import Heighted, is_known, path_of, Truth, UNKNOWN
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import geodesy, se2
@@ -99,11 +99,14 @@ class Drive:
         of_kind = {kind: (self.fix_stamps_ns[chosen], self.fix_positions[chosen])
                    for kind, chosen in self.fix_kinds.items()}
         if truth is not None:
-            true, doubted = (truth.stamps_ns, truth.poses[:, :2]), self.fix_kinds['doubted']
+            true = truth.stamps_ns, truth.poses[:, :2]
+            known, kinds = is_known(truth, self.fix_stamps_ns), self.fix_kinds
+            ours, doubted = ((self.fix_stamps_ns[chosen], self.fix_positions[chosen])
+                             for chosen in (known & ~kinds['doubted'], known & kinds['doubted']))
             for name, one, other in (
                     ('odometry alone', odometry, true),
-                    ('fixes', truth, (self.fix_stamps_ns[~doubted], self.fix_positions[~doubted])),
-                    ('doubted fixes', truth, of_kind['doubted']), ('corrected path', path, true)):
+                    ('fixes', truth, ours), ('doubted fixes', truth, doubted),
+                    ('corrected path', path, true)):
                 rows += error_rows(f'{name} to truth', distances(one, *other)[1])
             inside = path.covers(truth.stamps_ns) & np.isfinite(truth.poses[:, 2])
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(se2.wrap(
@@ -184,7 +187,7 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     """
     truth, path = drive.truth, drive.corrected
     assert truth is not None, 'only a truth tells errors'
-    inside = truth.covers(path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
+    inside = is_known(truth, path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
     true, poses = truth.at(path.stamps_ns[inside]), path.poses[inside]
     if np.any(np.isfinite(true[:, 2])) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
         # a truth may begin just after the fixed node: the surest one that it covers is as good

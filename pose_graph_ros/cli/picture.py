@@ -24,6 +24,7 @@ import numpy as np
 from pose_graph_ros.cli import drive as drives
 from pose_graph_ros.cli.drive import distances, Drive, extent
 from pose_graph_ros.cli.graph_input import SolvedGraph
+from pose_graph_ros.cli.truth import is_known
 from pose_graph_ros.core.geometry import geodesy, trajectory
 from pose_graph_ros.core.geometry.se2 import BoolArray, Poses
 from pose_graph_ros.core.graph.constraints import FactorKind
@@ -190,9 +191,11 @@ def _draw_errors(axes: Axes, drive: Drive) -> None:
     doubted, held_out = drive.fix_kinds['doubted'], drive.fix_kinds['held out']
     if truth is not None:
         target, true = 'the truth', (truth.stamps_ns, truth.poses[:, :2])
+        known = is_known(truth, stamps)
         lines = [(odometry, *true, of_odometry),
-                 (truth, stamps[~doubted], positions[~doubted], {**USED_FIXES, 'markersize': 3}),
-                 (truth, stamps[doubted], positions[doubted], DOUBTED_FIXES),
+                 (truth, stamps[known & ~doubted], positions[known & ~doubted],
+                  {**USED_FIXES, 'markersize': 3}),
+                 (truth, stamps[known & doubted], positions[known & doubted], DOUBTED_FIXES),
                  (result, *true, of_result)]
     elif len(stamps) == 0:
         target = 'the corrected path'

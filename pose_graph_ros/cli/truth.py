@@ -20,13 +20,15 @@ from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, ODOMETRY
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import compose, FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, compose, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.io.path_files import PathFile, read_path, seconds_text
 from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.quantities import Radians
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
+LONGEST_GAP_NS = 2 * 10**9  # between true poses, within which a robot moves nearly straight
+LEAST_ALIGNED = 3  # fewer places fit any path that has their distances
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 
@@ -69,12 +71,25 @@ class Truth(NamedTuple):
             return truth, None
         if not self.is_aligned:
             return truth, None
+        if self.file is not None and np.sum(inside) < LEAST_ALIGNED:
+            raise FileFormatError(
+                f'{self.file}: expected at least {LEAST_ALIGNED} poses in the time of the path, '
+                f'as fewer are moved to where they fit any, got {np.sum(inside)}; or --no-align')
         pose = fit_motion(truth.poses[inside, :2], path.at(truth.stamps_ns[inside])[:, :2])
         placed = Trajectory(truth.stamps_ns, compose(pose, truth.poses))
         return placed, abs(float(pose[2]))
 
 
 UNKNOWN = Truth()
+
+
+def is_known(truth: Trajectory, stamps_ns: IntArray) -> BoolArray:
+    """Return at which stamps the truth can be interpolated: not where it has a hole."""
+    known = truth.covers(stamps_ns)
+    before, after = (np.searchsorted(truth.stamps_ns, stamps_ns[known], side=side)
+                     for side in ('right', 'left'))
+    known[known] = truth.stamps_ns[after] - truth.stamps_ns[before - 1] <= LONGEST_GAP_NS
+    return known
 
 
 def truth_of(options: argparse.Namespace) -> Truth:

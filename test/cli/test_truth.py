@@ -80,6 +80,27 @@ def test_a_file_of_other_times_is_one_line_with_both(bag, tool, tmp_path, capsys
         f'the path, from {T0}.000000000 to {T0 + 39}.900000000 s\n')
 
 
+def test_two_poses_fit_any_path_so_they_are_not_aligned(bag, tmp_path, capsys) -> None:
+    file = tmp_path / 'truth.tum'
+    file.write_text(f'{T0 + 5} 0 0 0 0 0 0 1\n{T0 + 15} 1 0 0 0 0 0 1\n')
+    words = 'replay', str(bag), '-o', str(tmp_path / 'out'), '--truth', str(file)
+    assert main([*words]) == 2
+    assert 'truth.tum: expected at least 3 poses in the time' in capsys.readouterr().err
+    assert main([*words, '--no-align']) == 0
+
+
+def test_nothing_is_compared_where_the_truth_has_a_hole(bag, tmp_path, capsys) -> None:
+    file, out = write_truth(tmp_path / 'truth.tum', 'tum'), tmp_path / 'out'
+    file.write_text(''.join(
+        line for line in file.read_text().splitlines(keepends=True)
+        if line[0] in '\n#' or not 10.0 < float(line.split()[0]) - T0 < 30.0))
+    found = errors(capsys, bag, '-o', out, '--truth', file)
+    assert found['fixes to truth'] < 0.1
+    nees = json.loads((out / 'summary.json').read_text())['nees_position']
+    assert nees['within'] == 1.0
+    assert nees['count'] > 10
+
+
 def test_tune_compares_with_a_file(bag, tmp_path, capsys) -> None:
     file = write_truth(tmp_path / 'truth.tum', 'tum', (30.0, 40.0, 1.0))
     assert main(['tune', str(bag), '-o', str(tmp_path / 'tuned.yaml'), '--folds', '2', '--json',
@@ -108,6 +129,8 @@ def test_a_graph_is_compared_by_the_times_of_its_path(tmp_path, capsys) -> None:
     ('a.csv', '1,2,3\n', ':1: expected a header with the columns stamp, x, y'),
     ('a.csv', 't,x,y\n\n1,2\n', ':3: expected 3 values, stamp x y, got 2'),
     ('a.csv', 't,lat,lon\n1,91,0\n', ':2: expected latitude, a number of at most 90'),
+    ('a.csv', 't,x,y,yaw [deg]\n1,2,3,90\n', ":1: expected yaw in rad, got 'deg'"),
+    ('a.csv', 't,x (mm),y (mm)\n1,2,3\n', ":1: expected x in m, got 'mm'"),
     ('a.csv', '# nothing\n', ': holds no pose'), ('a.tum', b'\xff\xfe\0', ': no text')])
 def test_a_wrong_file_is_one_line_with_file_and_line(name, text, said, tmp_path, capsys) -> None:
     file = tmp_path / name

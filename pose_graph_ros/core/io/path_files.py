@@ -27,6 +27,9 @@ TUM = 'stamp', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'
 _SAME = {'t': 'stamp', 'time': 'stamp', 'timestamp': 'stamp', 'lat': 'latitude',
          'lon': 'longitude', 'altitude': 'z', 'theta': 'yaw'}
 """Other names of columns."""
+_UNITS = {'stamp': 's sec seconds', 'latitude': 'deg degree degrees \u00b0',
+          'longitude': 'deg degree degrees \u00b0', 'yaw': 'rad radian radians',
+          **dict.fromkeys(('x', 'y', 'z'), 'm metre metres meter meters')}
 _LARGEST = {'stamp': 2**63 / 1e9, 'latitude': 90.0, 'longitude': 360.0}
 
 
@@ -166,10 +169,15 @@ def read_path(path: Path) -> PathFile:
 
 def _header(where: str, line: str) -> tuple[str, ...]:
     """Return the names of the columns, without units; none for a comment."""
-    words = (re.split(r'[\s\[(]', word.strip(), maxsplit=1)[0].lower()
-             for word in line.lstrip(' #').split(','))
-    names = tuple(_SAME.get(word, word) for word in words)
+    words = [re.split(r'[\s\[(]+', word.strip().lower(), maxsplit=1)
+             for word in line.lstrip(' #').split(',')]
+    names = tuple(_SAME.get(name, name) for name, *_ in words)
     if {'stamp', 'x', 'y'} <= {*names} or {'stamp', 'latitude', 'longitude'} <= {*names}:
+        for name, (_, *rest) in zip(names, words, strict=True):
+            unit = ''.join(rest).strip(' ])')
+            if name in _UNITS and unit not in {'', *_UNITS[name].split()}:
+                raise FileFormatError(f'{where}: expected {name} in {_UNITS[name].split()[0]}, '
+                                      f'got {unit[:40]!r}')
         return names
     if line.lstrip().startswith('#'):
         return ()
