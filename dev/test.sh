@@ -22,7 +22,8 @@ run() { # name, command...
 run ruff "$PYTHON" -m ruff check
 # mypy takes one processor, so it runs beside the tests
 if [ -z "${ROS_DISTRO:-}" ]; then
-    "$PYTHON" -m mypy >"${types:=$(mktemp)}" 2>&1 &
+    types=$(mktemp)
+    "$PYTHON" -m mypy >"$types" 2>&1 &
     mypy=$!
     trap 'kill "$mypy" 2>/dev/null; rm -f "$types"' EXIT
 else
