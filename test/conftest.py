@@ -9,9 +9,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     Let two files follow each one that waits for other processes.
 
-    So the processors have something to do meanwhile, and none of those that wait is the last.
+    So the processors have something to do meanwhile, and none of those that wait is the last. They
+    run from the last name to the first, as those of the first names are short: all workers end
+    at about the same time.
     """
-    waiting, others = ({path: None for path in (item.path for item in items)
+    waiting, others = ({path: None for path in (item.path for item in reversed(items))
                         if (path.parent.name in ('ros', 'test')) is waits}
                        for waits in (True, False))
     turns = {path: 2 * turn for turn, path in enumerate(waiting)}

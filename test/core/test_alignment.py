@@ -223,13 +223,13 @@ def wrong(kind: str, some: Drive, rng: np.random.Generator, m: int) -> Drive:
 ], ids=['4', '8', '10', '30', '100', 'rtk', 'car'])
 def test_two_fifths_may_be_wrong(kind: str, n: int, m: int, gap: float, arguments: dict) -> None:
     aligned = 0
-    for seed in range(6):
+    for seed in range(4):
         result = found(wrong(kind, drive(seed, n, gap, **arguments),
                              np.random.default_rng(seed), m))
         if result.motion is not None:
             aligned += 1
             assert result.error < max(0.2, 5.0 * result.sigma), seed
-    assert aligned >= 4
+    assert aligned >= 3
 
 
 def test_with_most_of_them_wrong_no_wrong_angle_is_found() -> None:
@@ -247,7 +247,7 @@ def test_with_most_of_them_wrong_no_wrong_angle_is_found() -> None:
 def test_what_does_not_follow_the_robot_never_aligns(
     kind: str, n: int, gap: float, sigma: float,
 ) -> None:
-    for seed in range(4):
+    for seed in range(3):
         some = drive(seed, n, gap, sigma=sigma)
         if kind == 'mirrored' and np.ptp(np.unwrap(some.truth[:, 2])) < 2.0:
             continue    # so straight a drive does not show it

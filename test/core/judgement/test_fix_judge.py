@@ -164,7 +164,7 @@ def grow(drive: Drive) -> None:
     # or at the beginning
     (100, lambda drive: drive.move(0.0, 20.0, (30.0, 20.0)), (0.0, 20.0), 3, 99, 1.0),
     # which it was for some seconds
-    (200, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 2, 75, 0.5),
+    (140, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 2, 75, 0.5),
     (150, turn, (0.0, 0.0), 2, 125, 1.0),
     # odometry that is worse than it claims
     (200, noisier(2.0), (0.0, 0.0), 2, 190, 1.0), (200, noisier(4.0), (0.0, 0.0), 2, 190, 1.0),
@@ -254,13 +254,13 @@ def test_a_wrong_heading_that_stays_off_is_not_a_slip() -> None:
 
 @pytest.mark.parametrize(('wrong', 'right'), [(5, 5), (8, 4), (3, 7)])
 def test_errors_that_come_and_go_are_doubted_each_time(wrong: int, right: int) -> None:
-    drive = Drive(260)
-    for begin in range(60, 240, wrong + right):
+    drive = Drive(200)
+    for begin in range(60, 180, wrong + right):
         angle = drive.rng.uniform(-np.pi, np.pi)
         drive.move(begin, begin + wrong, (15.0 * np.cos(angle), 15.0 * np.sin(angle)))
     driven = Driven(drive)
-    assert driven.doubted == {f'fix/{number}' for number in range(60, 260)
-                              if (number - 60) % (wrong + right) < wrong and number < 240}
+    assert driven.doubted == {f'fix/{number}' for number in range(60, 200)
+                              if (number - 60) % (wrong + right) < wrong and number < 180}
     assert max(driven.newest.values()) < 2.0
     assert driven.rms < 0.4
 
