@@ -224,7 +224,8 @@ def yaml_value(text: str) -> Any:
             depth += (isinstance(event, yaml.CollectionStartEvent)
                       - isinstance(event, yaml.CollectionEndEvent))
             if depth > 50 or isinstance(event, yaml.AliasEvent):
-                raise ValueError('too deep, or an alias, which ROS does not read either')
+                raise ValueError(
+                    'too deep, or an alias, which rcl does not read: write what it is of')
         return yaml.safe_load(text)
     except Exception as error:  # the parser can raise anything
         raise ValueError(' '.join(str(error).split())) from error

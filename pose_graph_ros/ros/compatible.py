@@ -23,6 +23,7 @@ from std_srvs.srv import Empty, SetBool, Trigger
 
 from pose_graph_ros.adapters.conversions import yaw_of
 from pose_graph_ros.adapters.parameter_table import ROBOT_LOCALIZATION
+from pose_graph_ros.core.measurements import LARGEST_COORDINATE
 from pose_graph_ros.ros import log
 from pose_graph_ros.ros.services import Answer, Services, ServiceThread
 from pose_graph_ros.ros.session import Session
@@ -99,12 +100,21 @@ class Compatible(Services):
     def _on_earth(self, points: Sequence[Any]) -> tuple[list[Any], Answer]:
         """Return points of the map on the Earth, at the altitude that `gps/filtered` has."""
         datum = self._session.input.reader.datum
+        plane, level = datum.plane, datum.altitude
         positions = np.array([(point.x, point.y) for point in points]).reshape(-1, 2)
-        if datum.plane is None:
-            return [self._geo_point(latitude=math.nan, longitude=math.nan, altitude=math.nan)
-                    for _ in points], (False, NO_DATUM)
-        return [self._geo_point(latitude=latitude, longitude=longitude, altitude=datum.altitude)
-                for latitude, longitude, _ in datum.geodetic(positions).tolist()], (True, '')
+        found = np.full((len(positions), 3), math.nan)
+        if plane is None:
+            answer = False, NO_DATUM
+        else:
+            good = (np.abs(positions) <= LARGEST_COORDINATE).all(axis=1)
+            found[good] = plane.to_geodetic(
+                positions[good], level if math.isfinite(level) else plane.altitude)
+            found[good, 2] = level
+            answer = (True, '') if good.all() else (False, (
+                f'expected a point in the map, got {positions[~good][0].tolist()}: '
+                'NaN is answered'))
+        return [self._geo_point(latitude=latitude, longitude=longitude, altitude=altitude)
+                for latitude, longitude, altitude in found.tolist()], answer
 
     def _in_map(self, points: Sequence[Any]) -> tuple[list[Point], Answer]:
         """Return points of the Earth in the map, whatever their altitude: it is a plane."""

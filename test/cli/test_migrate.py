@@ -157,7 +157,8 @@ def test_the_datum_counts_if_it_is_waited_for_and_the_compass_is_turned(tmp_path
               'datum': [50.7, 7.1, 0.3]}
     tree = {'ekf': ekf('map', **WHEELS, **COMPASS), 'navsat': navsat}
     values, _ = migrated(tmp_path, tree)
-    assert values['datum'] == [50.7, 7.1, 0.3]
+    # navsat_transform_node turns its map by the offsets as well, whatever the datum says
+    assert values['datum'] == [50.7, 7.1, 2.05]
     assert values['imu.yaw_offset'] == 1.75
     values, text = migrated(tmp_path, {**tree, 'navsat': {**navsat, 'wait_for_datum': False}})
     assert values['datum'] == []
@@ -171,6 +172,62 @@ def test_files_of_ros_1_and_several_files_give_the_same(tmp_path) -> None:
     assert main(['migrate', *files, '-o', str(tmp_path / 'several.yaml')]) == 0
     assert parameter_values(argparse.Namespace(
         params_file=tmp_path / 'several.yaml', param=[])) == one
+
+
+def test_what_a_section_for_all_nodes_says_is_of_each_filter(tmp_path) -> None:
+    one, _ = migrated(tmp_path, OUTDOOR)
+    common = {name: value for name, value in OUTDOOR['filter_odom'].items()
+              if name.endswith(('_frame', '_mode', 'frequency')) and name != 'world_frame'}
+    tree = {'/**': common} | {node: {name: value for name, value in own.items()
+                                     if name not in common} for node, own in OUTDOOR.items()}
+    values, text = migrated(tmp_path, tree)
+    assert values == one
+    assert 'Keep filter_odom: it publishes odom -> base_footprint' in text
+    # in another namespace it says nothing of them
+    values, _ = migrated(tmp_path, {'/r1/**': tree.pop('/**'), **{
+        f'/r10/{node}': own for node, own in tree.items()}})
+    assert values['base_link_frame'] == 'base_link'
+
+
+def test_a_node_with_a_world_frame_alone_is_no_filter(tmp_path) -> None:
+    tree = {'camera': {'world_frame': 'odom'},
+            'navsat': {**NAVSAT, 'world_frame': 'map', 'map_frame': 'map'},
+            'filter_map': OUTDOOR['filter_map']}
+    values, text = migrated(tmp_path, tree)
+    assert values['odom.topic'] == 'wheels'
+    assert 'Stop navsat and filter_map: this node does the work' in text
+    assert listed(text)['Not known'] == {'camera.world_frame'}
+
+
+def test_names_with_a_slash_in_front_are_those_without(tmp_path) -> None:
+    tree = {**OUTDOOR, 'filter_map': {**OUTDOOR['filter_map'], 'world_frame': '/map',
+                                      'odom0': '/wheels'}}
+    values, _ = migrated(tmp_path, tree)
+    assert values['sources'] == ['odom', 'fix', 'imu'], 'the wheels do not count twice'
+
+
+def test_a_number_without_a_point_is_one_as_rcl_reads_it(tmp_path) -> None:
+    file = tmp_path / 'in.yaml'
+    file.write_text(f'ekf: {{world_frame: map, imu0: imu, imu0_config: {config("yaw")}}}\n'
+                    'navsat: {yaw_offset: 1e-1, wait_for_datum: true}')
+    out = tmp_path / 'out.yaml'
+    assert main(['migrate', str(file), '-o', str(out)]) == 0
+    assert yaml.safe_load(out.read_text())['/**']['ros__parameters']['imu']['yaw_offset'] == 0.1
+
+
+def test_a_yaw_in_the_odometry_frame_without_fixes_is_no_compass(tmp_path) -> None:
+    local = ekf('odom', **WHEELS, **COMPASS)
+    values, _ = migrated(tmp_path, {'ekf': local}, '--replace-local')
+    assert values['sources'] == ['odom', 'gyro']
+    values, _ = migrated(tmp_path, {'ekf': local, 'navsat': NAVSAT}, '--replace-local')
+    assert values['sources'] == ['odom', 'imu', 'fix']
+
+
+def test_the_output_has_another_name_than_an_input(tmp_path) -> None:
+    values, text = migrated(tmp_path, {'ekf': ekf('map', **WHEELS, **GNSS) | {
+        'odom0': '/odometry/filtered'}})
+    assert values['outputs.filtered_odometry'] == 'odometry/global'
+    assert 'filtered_odometry:=odometry/global' in text
 
 
 FUSE = {
@@ -251,6 +308,21 @@ def test_what_cannot_be_migrated_is_said_in_one_line(tmp_path, capsys, text, sai
 def test_the_launch_call_has_namespace_and_clock_of_the_nodes(tmp_path) -> None:
     _, text = migrated(tmp_path, {'/robot_1/ekf': {'use_sim_time': True, **ekf('map', **WHEELS)}})
     assert 'compatible:=robot_localization namespace:=robot_1 use_sim_time:=true' in text
+    # robot_localization itself publishes to /tf everywhere
+    assert 'where the other nodes use /tf, add remap_tf:=false' in re.sub(r'\n# +', ' ', text)
+
+
+def test_what_no_file_can_say_stands_under_what_to_do(tmp_path) -> None:
+    _, text = migrated(tmp_path, {'ekf': ekf('map', **COMPASS, twist0='speed',
+                                             twist0_config=config('vx'))})
+    said = re.sub(r'\n# +', ' ', text)
+    # as robot_localization takes the mounting of an IMU off its yaw
+    assert 'counterclockwise by some angle, take that off imu.yaw_offset' in said
+    assert 'A twist has no odometry frame, so map -> odom is not published' in said
+    _, text = migrated(tmp_path, {'ekf': ekf('odom', **WHEELS, pose0='amcl_pose',
+                                             pose0_config=config('x', 'y', 'yaw'))})
+    assert 'If amcl_pose is a pose in the map, such as that of AMCL, take it out of ekf' in (
+        re.sub(r'\n# +', ' ', text))
 
 
 def test_a_file_is_overwritten_only_by_force(tmp_path, capsys) -> None:

@@ -115,6 +115,10 @@ def test_without_a_datum_nan_is_answered_and_the_log_says_why(
     drive(client, 1.0)
     assert math.isnan(from_ll(client, 148.1, 11.6).x), 'not on Earth'
     assert 'fromLL: expected latitude in [-90, 90]' in node.stderr()
+    point = call(client, 'ToLL', 'toLL', map_point=Point(x=math.nan)).ll_point
+    assert math.isnan(point.altitude), 'no point at all'
+    assert 'toLL: expected a point in the map, got [nan, 0.0]' in node.stderr()
+    assert 'RuntimeWarning' not in node.stderr()
 
 
 @typed
