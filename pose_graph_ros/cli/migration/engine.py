@@ -77,7 +77,7 @@ class Migration:
 
     def hears(self, one: Input) -> bool:
         """Tell whether the filter that stays has the same input."""
-        return any(each.topic == one.topic for each in self.heard)
+        return any(each.topic.lstrip('/') == one.topic.lstrip('/') for each in self.heard)
 
     # --- sources
 
@@ -134,6 +134,8 @@ class Migration:
             self._set('fix.topic', 'gps/fix', f'{topic}: what {one.topic} is made of')
         else:
             self._set(f'{name}.topic', one.topic, topic)
+        if one.topic.lstrip('/') == ALONE:
+            self._set('outputs.filtered_odometry', GLOBAL, f'not the name of the input {name}')
         if kind == 'odometry' and not one.uses & {'x', 'y'}:
             self._set(f'{name}.integrate', 'twist', f'{use}: velocities')
         if kind == 'global_pose' and 'yaw' not in one.uses:
@@ -143,11 +145,8 @@ class Migration:
                       'is estimated and bends no path')
             self._set(f'{name}.sigma_floor', [0.01, 0.1], 'how much that may be [m, rad]')
         for navsat in self.of(System.NAVSAT) if kind == 'imu' else []:
-            angles = [navsat.values.get(part, 0.0) for part in ANGLES]
-            if any(isinstance(each, bool) or not isinstance(each, int | float) for each in angles):
-                raise ConfigError(f'{place(navsat, *ANGLES)}: expected numbers, got {angles}')
-            if sum(angles) != 0.0:
-                self._set(f'{name}.yaw_offset', round(sum(angles), 9), place(navsat, *ANGLES))
+            if (angle := _angle(navsat)) != 0.0:
+                self._set(f'{name}.yaw_offset', angle, place(navsat, *ANGLES))
 
     def type_of(self, source: str) -> str:
         """Return the type of a source, which is given or usual for its name."""
@@ -215,9 +214,20 @@ class Migration:
         if name == 'datum' and section.values.get('wait_for_datum') is not True:
             self._note(section, name, Fate.NOT_NEEDED, 'navsat_transform_node does not use it '
                        'either, as wait_for_datum is false')
-        elif name in ANGLES and value != 0.0 and (offset := next(
-                (each for each in self.settings if each.endswith('.yaw_offset')), '')) != '':
-            self._note(section, name, Fate.TAKEN, f'part of {offset}')
+        elif name == 'datum' and (angle := _angle(section)) != 0.0:
+            # navsat_transform_node adds them to the angle of a datum as to that of an IMU
+            rule = rule_of('navsat', name, value)
+            self._apply(section, name, value, rule._replace(
+                why=f'{rule.why}; {" and ".join(ANGLES)} are added to it, as there'), '')
+            if 'datum' in self.settings:
+                latitude, longitude, *yaw = self.settings['datum'].value
+                self.settings['datum'] = Setting([latitude, longitude, round(sum(yaw) + angle, 9)],
+                                                 place(section, name, *ANGLES))
+        elif name in ANGLES and value != 0.0 and len(parts := [
+                *(each for each in self.settings if each.endswith('.yaw_offset')),
+                *(['datum'] if section.values.get('wait_for_datum') is True
+                  and 'datum' in section.values else [])]) > 0:
+            self._note(section, name, Fate.TAKEN, f'part of {" and ".join(parts)}')
         else:
             return False
         return True
@@ -240,6 +250,14 @@ class Migration:
 
     def _note(self, section: Section, name: str, fate: Fate, sentence: str) -> None:
         self.entries.append(Entry(section, name, fate, sentence))
+
+
+def _angle(navsat: Section) -> float:
+    """Return what turns a compass to the east, of navsat_transform_node [rad]."""
+    angles = [navsat.values.get(part, 0.0) for part in ANGLES]
+    if any(isinstance(each, bool) or not isinstance(each, int | float) for each in angles):
+        raise ConfigError(f'{place(navsat, *ANGLES)}: expected numbers, got {angles}')
+    return round(sum(angles), 9)
 
 
 def _rule(system: System, plugins: dict[str, str], name: str, value: Any) -> Rule:

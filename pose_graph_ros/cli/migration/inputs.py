@@ -13,6 +13,7 @@ from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
+from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameters import yaml_value
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -28,10 +29,11 @@ class System(Enum):
 
 # A parameter that no other node has. Names of nodes are free, so these do not tell anything.
 SIGNATURES = {
-    System.FILTER: re.compile(r'(odom|imu|pose|twist)\d+_config|two_d_mode|world_frame'),
+    System.FILTER: re.compile(r'(odom|imu|pose|twist)\d+_config|two_d_mode'),
     System.NAVSAT: re.compile(
         r'magnetic_declination_radians|yaw_offset|zero_altitude|use_odometry_yaw|'
-        r'broadcast_(utm|cartesian)_transform|publish_filtered_gps|use_local_cartesian'),
+        r'broadcast_(utm|cartesian)_transform|publish_filtered_gps|use_local_cartesian|'
+        r'wait_for_datum'),
     System.FUSE: re.compile(r'(sensor_models|motion_models|publishers)\..+\.type|lag_duration'),
     System.SLAM_TOOLBOX: re.compile(r'solver_plugin|loop_search_maximum_distance|map_file_name|'
                                     r'ceres_linear_solver'),
@@ -50,8 +52,8 @@ class Section(NamedTuple):
 def in_map(section: Section) -> bool:
     """Tell whether a filter estimates in the map frame, by the defaults of robot_localization."""
     values = section.values
-    return bool(values.get('world_frame', values.get('odom_frame', 'odom')) == values.get(
-        'map_frame', 'map'))
+    world = values.get('world_frame', values.get('odom_frame', 'odom'))
+    return frame(str(world)) == frame(str(values.get('map_frame', 'map')))
 
 
 def place(section: Section, *names: str) -> str:
@@ -79,7 +81,20 @@ def read(paths: Sequence[Path]) -> list[Section]:
         if all(each.system is None for each in found):
             raise ConfigError(f'{path}: has no parameters of robot_localization, fuse or '
                               'slam_toolbox')
-        sections += found
+        sections += _shared_out(found)
+    return sections
+
+
+def _shared_out(sections: list[Section]) -> list[Section]:
+    """Return the nodes of a file, each with what a section for several, as `/**`, says of it."""
+    for shared in [each for each in sections if each.node.endswith('*')]:
+        # of a kind, as what tells the kind may be in it; alone it is that of a node
+        users = [each for each in sections if each is not shared and each.system is not None
+                 and shared.system in (None, each.system)
+                 and Path('/', each.node).is_relative_to(Path('/', shared.node.rstrip('*')))]
+        if len(users) > 0:
+            sections = [each._replace(values={**shared.values, **each.values})
+                        if each in users else each for each in sections if each is not shared]
     return sections
 
 
@@ -112,7 +127,9 @@ def _flat(tree: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, Any]
         if isinstance(value, Mapping) or len(named) > 0:
             yield from _flat(named or value, f'{prefix}{name}.')
         else:
-            yield f'{prefix}{name}', value
+            # rcl reads 1e-3 as a number, and the parser of Python as text
+            yield f'{prefix}{name}', float(value) if isinstance(value, str) and re.fullmatch(
+                r'[-+]?\d+(\.\d*)?[eE][-+]?\d+', value) else value
 
 
 # --- inputs
@@ -225,8 +242,10 @@ def kinds_of(one: Input, every: Collection[Input], *, in_map: bool, with_fixes: 
             return ['twist'] if 'vx' in uses else []
         case 'pose':
             return ['global_pose'] if {'x', 'y'} <= uses and not one.moves else []
-    kinds = ['imu'] if 'yaw' in uses and not one.moves else []
-    return [*kinds, 'gyro'] if 'vyaw' in uses or ('yaw' in uses and one.moves) else kinds
+    # in the odometry frame 0 is anywhere, unless fixes have to fit it
+    knows_east = in_map or with_fixes or any(each.is_gnss for each in every)
+    kinds = ['imu'] if 'yaw' in uses and knows_east and not one.moves else []
+    return [*kinds, 'gyro'] if 'vyaw' in uses or ('yaw' in uses and len(kinds) == 0) else kinds
 
 
 def free_name(one: Input, kind: str, kinds: Sequence[str], named: Sequence[str],

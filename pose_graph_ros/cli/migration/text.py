@@ -88,15 +88,7 @@ def steps(migration: Migration) -> Iterator[str]:
     else:
         yield (f'Another node has to publish {lower}, such as the driver of the wheels. If a '
                'filter of robot_localization does, give its file as well.')
-    for one, names in migration.names.items():
-        if 'odometry' in names and kept is None and not one.uses & {'yaw', 'vyaw'}:
-            yield (f'The yaw of {one.topic} was not used before and is now: if it is bad, set '
-                   f'{names["odometry"]}.sigma_heading_turn to 1, so that others decide.')
-        if 'imu' in names:
-            yield (f'The yaw of {one.topic} is used as it is, 0 in the east, whatever /tf_static '
-                   'says: if the IMU is turned on the robot, add that to '
-                   f'{names["imu"]}.yaw_offset. It tells where the robot heads before it has '
-                   'driven; without a compass that does, take it out of sources.')
+    yield from _of_inputs(migration)
     if 'fix.topic' in settings:
         yield ('fix.topic is the usual name of what navsat_transform_node listens to: look for a '
                'remap of gps/fix. The place of the antenna is taken from /tf_static, or set '
@@ -108,8 +100,27 @@ def steps(migration: Migration) -> Iterator[str]:
     elif not any(KINDS[migration.type_of(name)].in_map for name in settings['sources'].value):
         yield ('Nothing tells where the robot is in the map: add fix or global_pose to sources. '
                'Loop closures are always listened to, on the topic loop_closure.')
+    if migration.type_of(settings['sources'].value[0]) == 'twist':
+        yield (f'A twist has no odometry frame, so {upper} is not published: take what publishes '
+               f'{lower} as odometry.')
+    if (space := _namespace(migration)) != '':
+        yield (f'In {space} the launch file uses the topics tf and tf_static of the namespace: '
+               'where the other nodes use /tf, add remap_tf:=false.')
     if settings['sources'].value[0] == 'odom' and 'no file' in settings['odom.topic'].why:
         yield 'Write the topic of the odometry to odom.topic: no file tells it.'
+
+
+def _of_inputs(migration: Migration) -> Iterator[str]:
+    """Yield what is to be looked at of single inputs."""
+    for one, names in migration.names.items():
+        if 'odometry' in names and migration.kept is None and not one.uses & {'yaw', 'vyaw'}:
+            yield (f'The yaw of {one.topic} was not used before and is now: if it is bad, set '
+                   f'{names["odometry"]}.sigma_heading_turn to 1, so that others decide.')
+        if 'imu' in names:
+            yield (f'The yaw of {one.topic} is used as it is, 0 in the east, whatever /tf_static '
+                   'says: if the IMU is turned on the robot, counterclockwise by some angle, take '
+                   f'that off {names["imu"]}.yaw_offset. It tells where the robot heads before it '
+                   'has driven; without a compass that does, take it out of sources.')
 
 
 def _beside(migration: Migration, node: str, upper: str, lower: str) -> Iterator[str]:
@@ -117,6 +128,11 @@ def _beside(migration: Migration, node: str, upper: str, lower: str) -> Iterator
     yield (f'Keep {node}: it publishes {lower}, which this node does not. Its output is the '
            f'odometry here, since {upper} has to fit that transform. Look up in your launch file '
            'what odometry/filtered of it is remapped to, and write that to odom.topic.')
+    for one in migration.heard:
+        if one.message == 'pose' and {'x', 'y'} <= one.uses and not one.moves:
+            yield (f'If {one.topic} is a pose in the map, such as that of AMCL, take it out of '
+                   f'{node}, whose output must know nothing of the map, and add it here as a '
+                   'source of type global_pose.')
     if any(one.message == 'imu' for one in migration.heard):
         yield ('There is no source of type gyro: what the IMU tells of turns is in the output of '
                f'{node} already, and would count twice. More exact are the wheels and the '
@@ -130,15 +146,22 @@ def launch_call(migration: Migration, out: Path) -> str:
     words = [f'params_file:={out}']
     if len(migration.of(System.FILTER, System.NAVSAT)) > 0:
         words.append('compatible:=robot_localization')
-    if migration.kept is not None:
+    output = migration.settings.get('outputs.filtered_odometry')
+    if output is not None and output.value == GLOBAL:
         words.append(f'filtered_odometry:={GLOBAL}')
-    spaces = {each.node.rpartition('/')[0].strip('/') for each in migration.sections
-              if each.system is not None}
-    if len(spaces) == 1 and re.fullmatch(r'[\w/]+', space := min(spaces)):
+    if (space := _namespace(migration)) != '':
         words.append(f'namespace:={space}')
     if any(each.values.get('use_sim_time') is True for each in migration.sections):
         words.append('use_sim_time:=true')
     return shlex.join(['ros2', 'launch', 'pose_graph_ros', 'pose_graph.launch.py', *words])
+
+
+def _namespace(migration: Migration) -> str:
+    """Return the namespace that the nodes have in common; empty if there is none."""
+    spaces = {each.node.rpartition('/')[0].strip('/') for each in migration.sections
+              if each.system is not None}
+    return space if len(spaces) == 1 and re.fullmatch(
+        r'[\w/]+', space := min(spaces)) else ''
 
 
 def _publishes_odometry(section: Section) -> bool:
