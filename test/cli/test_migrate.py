@@ -160,6 +160,8 @@ def test_the_datum_counts_if_it_is_waited_for_and_the_compass_is_turned(tmp_path
     # navsat_transform_node turns its map by the offsets as well, whatever the datum says
     assert values['datum'] == [50.7, 7.1, 2.05]
     assert values['imu.yaw_offset'] == 1.75
+    values, _ = migrated(tmp_path, {**tree, 'navsat': {**navsat, 'datum': []}})
+    assert values['datum'] == []
     values, text = migrated(tmp_path, {**tree, 'navsat': {**navsat, 'wait_for_datum': False}})
     assert values['datum'] == []
     assert 'navsat.datum' in listed(text)['Not needed']
@@ -293,6 +295,10 @@ def test_of_slam_toolbox_what_concerns_the_graph_is_taken(tmp_path) -> None:
     ('/**: {ros__parameters: {sources: [odom], minimum_travel_heading: 1.0}}', 'already'),
     ('ekf: {ros__parameters: {world_frame: map, odom0: $(var robot)/odom, odom0_config: '
      f'{config("vx")}}}}}', "odom0: '$(var robot)/odom' is filled in by a launch file"),
+    ('navsat: {ros__parameters: {wait_for_datum: true, datum: $(var site), yaw_offset: 1.5}}',
+     "datum: '$(var site)' is filled in by a launch file"),
+    ('navsat: {ros__parameters: {wait_for_datum: true, datum: [1, 2], yaw_offset: .nan}}',
+     'yaw_offset and magnetic_declination_radians: expected angles [rad], got [nan, 0.0]'),
     ('ekf: {ros__parameters: {world_frame: odom, map_frame: odom, odom0: o, odom0_config: '
      f'{config("vx")}}}}}', 'expected three different names')])
 def test_what_cannot_be_migrated_is_said_in_one_line(tmp_path, capsys, text, said) -> None:

@@ -219,8 +219,10 @@ class Migration:
             rule = rule_of('navsat', name, value)
             self._apply(section, name, value, rule._replace(
                 why=f'{rule.why}; {" and ".join(ANGLES)} are added to it, as there'), '')
-            if 'datum' in self.settings:
-                latitude, longitude, *yaw = self.settings['datum'].value
+            taken = [] if '$(' in str(value) or 'datum' not in self.settings else (
+                self.settings['datum'].value)
+            if len(taken) > 0:
+                latitude, longitude, *yaw = taken
                 self.settings['datum'] = Setting([latitude, longitude, round(sum(yaw) + angle, 9)],
                                                  place(section, name, *ANGLES))
         elif name in ANGLES and value != 0.0 and len(parts := [
@@ -255,8 +257,9 @@ class Migration:
 def _angle(navsat: Section) -> float:
     """Return what turns a compass to the east, of navsat_transform_node [rad]."""
     angles = [navsat.values.get(part, 0.0) for part in ANGLES]
-    if any(isinstance(each, bool) or not isinstance(each, int | float) for each in angles):
-        raise ConfigError(f'{place(navsat, *ANGLES)}: expected numbers, got {angles}')
+    if any(isinstance(each, bool) or not isinstance(each, int | float) or not abs(each) < 100.0
+           for each in angles):
+        raise ConfigError(f'{place(navsat, *ANGLES)}: expected angles [rad], got {angles}')
     return round(sum(angles), 9)
 
 
