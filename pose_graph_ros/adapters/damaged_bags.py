@@ -206,10 +206,15 @@ class _Ros1(_Walked):
     """A bag of ROS 1, cut short or with damaged bytes."""
 
     def messages(self) -> Iterator[_Message]:
-        """Yield all messages."""
-        return self._messages(self._file, len(b'#ROSBAG V2.0\n'))
+        """Yield all messages; what defines them may also stand behind them, at the index."""
+        begin = len(b'#ROSBAG V2.0\n')
+        for _ in self._messages(self._file, begin, unpack=False):
+            pass
+        self.n_damaged = 0
+        return self._messages(self._file, begin)
 
-    def _messages(self, data: bytes | mmap.mmap, at: int) -> Iterator[_Message]:
+    def _messages(self, data: bytes | mmap.mmap, at: int, *,
+                  unpack: bool = True) -> Iterator[_Message]:
         """Yield the messages of the records that make sense."""
         while at < len(data):
             begin = at + 8 + _number(data[at:at + 4])
@@ -227,7 +232,8 @@ class _Ros1(_Walked):
                 form = fields.get(b'compression', b'').decode(errors='replace')
                 if end == begin and form != 'none':     # it was being written
                     end = len(data)
-                yield from self._in_chunk(form, data[begin:end])
+                if unpack:
+                    yield from self._in_chunk(form, data[begin:end])
             number = _number(fields.get(b'conn', b''))
             if kind == _ROS1_CONNECTION and number not in self._topics:
                 about = {**fields, **_fields(data[begin:end])}

@@ -93,6 +93,17 @@ def test_all_before_the_part_that_was_cut_is_read_as_it_was(form, tmp_path, capl
         assert len(found) == 0 or 'what can be read of it is used' in caplog.text
 
 
+def test_ros_1_is_read_without_its_first_chunk_which_defines_the_topics(tmp_path) -> None:
+    path = write_ros1(tmp_path / 'bag.bag', 'bz2')
+    data = bytearray(path.read_bytes())
+    at = data.index(b'compression=bz2') + 1000
+    data[at:at + 1000] = bytes(1000)
+    path.write_bytes(data)
+    found, sent = read(path), list(enumerate(texts()))
+    assert found == sent[len(sent) - len(found):]
+    assert len(found) > (1.0 - CHUNK) * len(sent)
+
+
 @pytest.mark.parametrize('form', ['none', 'lz4', 'bz2'])
 def test_the_chunk_that_ros_1_was_writing_is_read(form, tmp_path) -> None:
     """Its header gets the length only when it is full."""
