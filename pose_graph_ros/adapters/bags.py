@@ -106,8 +106,9 @@ class Bag:
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
+        self.damage = dict[Path, str]()  # a sentence for each of the bags that is not whole
         with ExitStack() as stack:
-            parts = [(path, _reader(path, stack)) for path in paths]
+            parts = [(path, _reader(path, stack, self.damage)) for path in paths]
             self._stack = stack.pop_all()
         self._parts = sorted(parts, key=lambda part: part[1].start_time)
         self._decoders: dict[tuple[Path, str], Callable[[bytes], Any]] = {}
@@ -174,7 +175,7 @@ class Bag:
         except Exception as error:  # the parsers can raise anything on a damaged file
             text = f'damaged after {seen.total()} messages: {one_line(error)}'
             with ExitStack() as stack:
-                if (rest := _repaired(path, text, stack)) is None:
+                if (rest := _repaired(path, text, stack, self.damage)) is None:
                     raise BagError(f'{path}: {text}') from error
                 yield from self._read(path, rest, topics, span if last_ns is None else Span(
                     last_ns + 1, span.end_ns))
@@ -196,7 +197,7 @@ def open_bag(*paths: str | Path) -> Bag:
     return Bag([Path(path) for path in paths])
 
 
-def _reader(path: Path, stack: ExitStack) -> Reader:
+def _reader(path: Path, stack: ExitStack, damage: dict[Path, str]) -> Reader:
     """Return an open reader, which the stack closes."""
     if not path.exists():
         raise BagError(f'{path}: does not exist')
@@ -204,7 +205,8 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
         raise BagError(f'{path}: no bag, expected a rosbag2 folder or a file ending in '
                        f'{", ".join(BAG_FILE_SUFFIXES)}')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
-        rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack)
+        rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack,
+                         damage)
         if rest is None:
             inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
             hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
@@ -212,12 +214,13 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
         return rest
     files = path.iterdir() if path.is_dir() else path.parent.glob(f'{glob.escape(path.name)}-*')
     if any(each.name.endswith(JOURNALS) and each.stat().st_size > 0 for each in files) and (
-            rest := _repaired(path, 'the recording was not ended, it has a journal', stack)):
+            rest := _repaired(
+                path, 'the recording was not ended, it has a journal', stack, damage)):
         return rest
     try:
         return _opened(path, path, stack)
     except Exception as error:  # the parsers can raise anything on a damaged file
-        if (rest := _repaired(path, f'damaged or cut short: {one_line(error)}', stack)):
+        if (rest := _repaired(path, f'damaged or cut short: {one_line(error)}', stack, damage)):
             return rest
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
@@ -231,12 +234,19 @@ def _opened(path: Path, copy: Path, stack: ExitStack) -> Reader:
     return reader
 
 
-def _repaired(path: Path, reason: str, stack: ExitStack) -> Reader | None:
+def _repaired(
+    path: Path, reason: str, stack: ExitStack, damage: dict[Path, str],
+) -> Reader | None:
     """Return a reader of a copy of what can be read of a bag; None if nothing can."""
     folder = stack.enter_context(TemporaryDirectory(prefix='pose_graph_'))
     copy = Path(folder, 'bag')
     try:
-        return _opened(path, copy, stack) if repair(path, reason, copy) else None
+        if not (sentence := repair(path, reason, copy)):
+            return None
+        reader = _opened(path, copy, stack)
+        logger.warning(sentence)
+        damage.setdefault(path, sentence)   # it may be read more than once
+        return reader
     except OSError as error:
         raise BagError(f'{path}: {reason}; what can be read of it cannot be copied to '
                        f'{folder}: {one_line(error)}') from error

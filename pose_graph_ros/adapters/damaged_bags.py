@@ -13,7 +13,6 @@ from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
-import logging
 import mmap
 from pathlib import Path
 import re
@@ -30,11 +29,11 @@ from rosbags.rosbag2 import metadata, storage_mcap, StoragePlugin, Writer
 from rosbags.typesys.msg import normalize_msgtype
 import yaml
 
-logger = logging.getLogger(__name__)
 zstd = storage_mcap.zstd
 
 ROS1_SUFFIXES = '.bag', '.active'     # `record` adds the second one until it has ended
 LONGEST_CHUNK = 2**30   # as much is made of one at most [bytes]
+MISSING_NS = 100_000_000  # less than this at the end is not told as missing [ns]
 NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 # Kinds of records of an mcap file, and what they begin with.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = range(2, 7)
@@ -322,18 +321,19 @@ def _messages_in(file: Path, connect: Connect,
                     yield connection, recorded_ns, data
 
 
-def repair(path: Path, reason: str, copy: Path) -> bool:
+def repair(path: Path, reason: str, copy: Path) -> str:
     """
     Write what can be read of a file or a folder of .mcap or .db3 files as a bag, if anything can.
 
-    A warning says how much time is missing, as far as the metadata beside the files tell.
+    Returns a sentence that says how much time is missing, as far as the metadata beside the files
+    tell; an empty one if nothing can be read.
     """
     about: Any = {}
     with suppress(OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
         text = ((path if path.is_dir() else path.parent) / 'metadata.yaml').read_text('utf-8')
         about = dict(yaml.safe_load(text)['rosbag2_bagfile_information'])
     if about.get('compression_format') not in {None, '', 'zstd'}:
-        return False    # rosbag2 has none but zstd, and its messages cannot be unpacked here
+        return ''   # rosbag2 has none but zstd, and its messages cannot be unpacked here
     listed = [Path(str(name)).name for name in about.get('relative_file_paths') or ()]
     files = [path] if path.is_file() else [each for each in [
         path / name for name in listed if (path / name).is_file()] or sorted(path.iterdir())
@@ -348,16 +348,15 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
                 writer.write(connection, recorded_ns, data)
                 n, begin_ns, end_ns = n + 1, min(begin_ns, recorded_ns), max(end_ns, recorded_ns)
     if n == 0:
-        return False
-    missing = 'how much is missing is not known'
+        return ''
+    is_whole = len(found) == len(files) and all(each.complete for each in found)
+    missing = 'its end is there' if is_whole else 'how much is missing is not known'
     if path.is_dir() or listed == [path.name]:
         with suppress(KeyError, TypeError, ValueError):
             wanted_ns = (int(about['starting_time']['nanoseconds_since_epoch'])
                          + int(about['duration']['nanoseconds']))
-            missing = f'{max(1e-9 * (wanted_ns - end_ns), 0.0):.1f} s at the end are missing'
-    if len(found) == len(files) and all(each.complete for each in found):
-        missing = 'its end is there'
-    logger.warning('%s: %s; what can be read of it is used: '
-                   '%d messages in %.1f s, %d damaged parts are left out, %s', path, reason, n,
-                   1e-9 * (end_ns + 1 - begin_ns), sum(each.n_damaged for each in found), missing)
-    return True
+            if wanted_ns > end_ns + MISSING_NS or not is_whole:
+                missing = f'{max(1e-9 * (wanted_ns - end_ns), 0.0):.1f} s at the end are missing'
+    return (f'{path}: {reason}; what can be read of it is used: {n} messages in '
+            f'{1e-9 * (end_ns + 1 - begin_ns):.1f} s, {sum(each.n_damaged for each in found)} '
+            f'damaged parts are left out, {missing}')

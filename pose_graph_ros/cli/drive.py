@@ -70,6 +70,7 @@ class Drive:
     """Stamps of what was measured, in the order of arrival, by source."""
     odometry_heights: FloatArray = field(default_factory=lambda: np.zeros(0))   # [m]
     truth_heights: FloatArray = field(default_factory=lambda: np.zeros(0))  # NaN: unknown [m]
+    damage: Sequence[str] = ()  # what is missing in its bags
     truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
 
     @property
@@ -285,8 +286,9 @@ def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseG
     drive = collect_drive(
         measured_in(bag, inputs, reader, Counter(), held_out=True, heights=heights), backend,
         inputs.odometry[0], refused, heights)
-    return with_truth(replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y')),
-                      truth, truth.read(bag, inputs.span, reader.datum.plane))
+    drive = replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
+                    damage=[*bag.damage.values()])
+    return with_truth(drive, truth, truth.read(bag, inputs.span, reader.datum.plane))
 
 
 def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,

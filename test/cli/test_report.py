@@ -162,3 +162,5 @@ def test_a_recording_that_was_cut_off_has_a_report(bag, tmp_path) -> None:
     (file,) = bag.glob('*.mcap')
     (cut / file.name).write_bytes(file.read_bytes()[:-1000])
     assert run(cut, '--run', tmp_path / 'out') == 0
+    found = json.loads((tmp_path / 'out' / 'run.json').read_text(encoding='utf-8'))['findings']
+    assert 'has no metadata.yaml; what can be read of it is used' in found[0]['text']

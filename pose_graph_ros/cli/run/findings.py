@@ -66,6 +66,7 @@ def in_order(findings: Iterable[Finding]) -> list[dict[str, Any]]:
 def _whole(run: Run) -> Iterator[Finding]:
     """Yield what concerns the whole graph."""
     estimate, report = run.estimate, run.report
+    yield from (Finding('warning', text, 'map') for text in run.drive.damage)
     if report.status is not Status.CONVERGED:
         reason = f': {report.reason}' if report.reason else ''
         yield Finding('warning', f'the final optimisation did not converge ({report.status.value}'
