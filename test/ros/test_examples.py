@@ -10,7 +10,7 @@ from circle import START, true_pose
 from geometry_msgs.msg import PoseStamped
 from harness import Client, NodeProcess, odometry, RELIABLE, stamp_ns, yaw
 import numpy as np
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import BatteryState, LaserScan
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.examples import scan_closures
@@ -95,3 +95,29 @@ def test_scans_of_a_second_round_correct_the_path(node: NodeProcess, client: Cli
     assert client.optimize().success
     assert client.values.get('loop_closure.doubted', '0') == '0'
     assert revisit_error(client.paths[-1].poses) < 0.1
+
+
+def test_a_robot_in_its_dock_is_where_it_was(node: NodeProcess, client: Client) -> None:
+    """Three rounds from the dock and back, by odometry that turns by 2 % too much."""
+    lap, turn = 20.0 * math.pi, 0.102
+    battery = client.node.create_publisher(BatteryState, 'battery_state', RELIABLE)
+    with subprocess.Popen([sys.executable, '-m', 'pose_graph_ros.examples.dock_closures'],
+                          env=node.env) as example:
+        try:
+            client.spin_until(lambda: battery.get_subscription_count() > 0, 'it listens')
+            for step in range(round(30.0 * lap) + 1):
+                at = step / 10.0
+                message = odometry(START + at, 2.0 / turn * math.sin(turn * at),
+                                   2.0 / turn * (1.0 - math.cos(turn * at)), turn * at, 2.0)
+                client.odom.publish(message)
+                charges = at % lap < 0.1
+                battery.publish(BatteryState(header=message.header, power_supply_status=(
+                    BatteryState.POWER_SUPPLY_STATUS_CHARGING if charges
+                    else BatteryState.POWER_SUPPLY_STATUS_DISCHARGING)))
+                client.spin_for(0.002)
+            client.wait_values({'loop_closure.believed': '3'})
+        finally:
+            example.kill()
+    assert client.optimize().success
+    first, *_, last = (item.pose.position for item in client.paths[-1].poses)
+    assert math.dist((first.x, first.y), (last.x, last.y)) < 0.3
