@@ -303,7 +303,7 @@ class Inputs:
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.hold_out == 1:
-            raise BagError(f'hold out: expected 0 or at least 2, got {self.hold_out}')
+            raise BagError(f'--hold-out: expected 0 or at least 2, got {self.hold_out}')
 
     def of(self, is_wanted: Callable[[Kind], bool]) -> list[str]:
         """Return the names of the sources of some kinds."""

@@ -300,6 +300,9 @@ def _execute_bags(options: argparse.Namespace) -> int:
             shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, truth,
             origin=None if plane is None else plane.origin, refused=result.refused),
             values, inputs.kinds)
+        if options.hold_out and not np.any(held_out := done.drive.fix_kinds['held out']):
+            raise BagError(f'--hold-out {options.hold_out}: expected less, of {len(held_out)} '
+                           'fixes none is held out')
         full = None
         if FULL in options.export.formats:
             full = done.estimate.path.filled(_Corrector(bag, inputs, done).correction, _samples(

@@ -156,5 +156,6 @@ def test_whole_stretches_of_the_drive_are_held_out(tmp_path, capsys) -> None:
         15.0 <= t < 20.0 or t >= 35.0 for t in fixes_there['t']]
     assert fixes_there['state'].count(HELD_OUT) == 20
     for words, said in ((('--stretch', 5), 'expected --hold-out N'),
-                        (('--hold-out', 4, '--stretch', 11), 'at most 10 s')):
+                        (('--hold-out', 4, '--stretch', 11), 'at most 10 s'),
+                        (('--hold-out', 1000), 'fixes none is held out')):
         assert said in error_of(capsys, tmp_path / 'bag', *words)
