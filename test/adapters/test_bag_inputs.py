@@ -137,5 +137,5 @@ def test_an_option_for_a_source_that_is_not_there_says_so() -> None:
 
 @pytest.mark.parametrize('hold_out', [-1, 1])
 def test_holding_out_all_or_less_than_none_is_refused(hold_out: int) -> None:
-    with pytest.raises(BagError, match='hold out'):
+    with pytest.raises(BagError, match='--hold-out'):
         Inputs({'odom': '/odom'}, hold_out=hold_out)

@@ -110,10 +110,10 @@ def test_a_robot_in_its_dock_is_where_it_was(node: NodeProcess, client: Client) 
                 message = odometry(START + at, 2.0 / turn * math.sin(turn * at),
                                    2.0 / turn * (1.0 - math.cos(turn * at)), turn * at, 2.0)
                 client.odom.publish(message)
-                charges = at % lap < 0.1
-                battery.publish(BatteryState(header=message.header, power_supply_status=(
-                    BatteryState.POWER_SUPPLY_STATUS_CHARGING if charges
-                    else BatteryState.POWER_SUPPLY_STATUS_DISCHARGING)))
+                if at % lap < 0.2:  # in the dock, and when it has left
+                    battery.publish(BatteryState(header=message.header, power_supply_status=(
+                        BatteryState.POWER_SUPPLY_STATUS_CHARGING if at % lap < 0.1
+                        else BatteryState.POWER_SUPPLY_STATUS_DISCHARGING)))
                 client.spin_for(0.002)
             client.wait_values({'loop_closure.believed': '3'})
         finally:
