@@ -3,11 +3,8 @@
 """
 Read a graph from a g2o file or a saved graph, and choose its nodes by their ids in the file.
 
-It is kept as it was before and after its optimisation, for pictures and reports.
-
-A g2o, TORO or iSAM file as odometry and loop closures over time, as if a robot sent them.
-
-An edge from each vertex to the next one is odometry; its other edges are loop closures, which come
+Such a file can also be read as odometry and loop closures over time, as if a robot sent them: an
+edge from each vertex to the next one is odometry; its other edges are loop closures, which come
 when the later one of their ends is reached. The vertices are a second apart.
 """
 
@@ -16,20 +13,15 @@ from operator import itemgetter
 from pathlib import Path
 import re
 import sys
-from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
-
-if TYPE_CHECKING:
-    from pose_graph_ros.cli.solve import Problem
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 SAVED = b'{\n"sha256": "'  # begin of the .json file of a saved graph
@@ -141,40 +133,3 @@ def _covariances(edges: Factors) -> FloatArray:
     regular = np.linalg.det(edges.information) > 0.0
     covariances[regular] = np.linalg.inv(edges.information[regular])
     return covariances
-
-
-class SolvedGraph(NamedTuple):
-    """N hidden nodes and M constraints, whose ends are rows of the nodes."""
-
-    ids: IntArray  # in the file, increasing
-    is_pose: BoolArray  # else a landmark
-    is_fixed: BoolArray
-    before: Poses
-    after: Poses
-    factors: Factors
-    off: FloatArray  # how far each constraint is off, without its weight if that is 0 [sigma]
-    is_odometry: BoolArray  # edges with no id of a pose between their two
-    is_doubted: BoolArray
-    chi2_before: float
-    result: BatchResult
-
-    @property
-    def is_closure(self) -> BoolArray:
-        """Which constraints are loop closures, or sightings of landmarks."""
-        return (self.factors.j >= 0) & ~self.is_odometry
-
-
-def solved_graph(problem: 'Problem', before: Poses, chi2_before: float, result: BatchResult,
-                 doubted: IntArray) -> SolvedGraph:
-    """Return a graph at its optimum; `doubted` are rows of edges, whose weight is 0."""
-    graph = problem.graph
-    factors, place = graph.factors_by_row, np.cumsum(graph.is_pose)
-    squares = graph.energies().factors
-    if len(doubted) > 0:
-        squares[doubted] = problem.engine.unweighted_energies(doubted)
-    return SolvedGraph(
-        problem.ids, graph.is_pose, graph.fixed, before, graph.poses.copy(), factors,
-        np.sqrt(squares),
-        (factors.kind <= FactorKind.LOOP_CLOSURE) & (
-            np.abs(place[factors.j] - place[factors.i]) == 1),
-        np.isin(np.arange(len(factors)), doubted), chi2_before, result)

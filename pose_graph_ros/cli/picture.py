@@ -23,7 +23,7 @@ import numpy as np
 
 from pose_graph_ros.cli import drive as drives
 from pose_graph_ros.cli.drive import distances, Drive, extent
-from pose_graph_ros.cli.graph_input import SolvedGraph
+from pose_graph_ros.cli.solved_graph import SolvedGraph
 from pose_graph_ros.cli.truth import is_known
 from pose_graph_ros.core.geometry import geodesy, trajectory
 from pose_graph_ros.core.geometry.se2 import BoolArray, Poses

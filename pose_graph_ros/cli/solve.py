@@ -22,7 +22,8 @@ import numpy as np
 
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
-from pose_graph_ros.cli.graph_input import read_file, rows_of, solved_graph
+from pose_graph_ros.cli.graph_input import read_file, rows_of
+from pose_graph_ros.cli.solved_graph import SolvedGraph
 from pose_graph_ros.core import config, sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
@@ -92,6 +93,21 @@ class Problem:
             graph.set_poses(self.plain.poses)
             self.plain = None
         return graph
+
+    def solved(self, before: Poses, chi2_before: float, result: BatchResult,
+               doubted: IntArray) -> SolvedGraph:
+        """Return the graph at its optimum; `doubted` are rows of edges, whose weight is 0."""
+        graph = self.graph
+        factors, place = graph.factors_by_row, np.cumsum(graph.is_pose)
+        squares = graph.energies().factors
+        if len(doubted) > 0:
+            squares[doubted] = self.engine.unweighted_energies(doubted)
+        return SolvedGraph(
+            self.ids, graph.is_pose, graph.fixed, before, graph.poses.copy(), factors,
+            np.sqrt(squares),
+            (factors.kind <= constraints.FactorKind.LOOP_CLOSURE) & (
+                np.abs(place[factors.j] - place[factors.i]) == 1),
+            np.isin(np.arange(len(factors)), doubted), chi2_before, result)
 
 
 def solve(problem: Problem, start: str) -> Solution:
@@ -296,7 +312,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         # matplotlib takes half a second to load
         from pose_graph_ros.cli.picture import draw_solved
 
-        draw_solved(solved_graph(problem, poses, before, solution.result, doubted),
+        draw_solved(problem.solved(poses, before, solution.result, doubted),
                     options.picture, options.graph.name)
     if options.json:
         graph, result = problem.graph, solution.result

@@ -131,9 +131,11 @@ def _judged_otherwise(a: Mapping[str, Any], b: Mapping[str, Any], table: str, la
 
     def times_of(each: Mapping[str, Any], later: float) -> FloatArray:
         """Return the times of both ends, and the how many-th with these it is, shape (N, 3)."""
-        seen = Counter[tuple[float, float]]()
-        return np.array([(t0 + later, t1 + later, seen.update([(t0, t1)]) or seen[t0, t1])
-                         for t0, t1 in zip(each[ends[0]], each[ends[1]], strict=True)])
+        seen, rows = Counter[tuple[float, float]](), list[tuple[float, float, int]]()
+        for key in zip(each[ends[0]], each[ends[1]], strict=True):
+            seen[key] += 1
+            rows.append((key[0] + later, key[1] + later, seen[key]))
+        return np.array(rows)
 
     for one in a[table]:
         other = next((each for each in b[table] if each['source'] == one['source']), None)

@@ -16,11 +16,12 @@ import numpy as np
 
 from pose_graph_ros.adapters import sources as kinds
 from pose_graph_ros.cli import drive as drives, solve
-from pose_graph_ros.cli.graph_input import read_file, solved_graph, SolvedGraph
+from pose_graph_ros.cli.graph_input import read_file
 from pose_graph_ros.cli.run import document, findings, Frame, number, rounded
 from pose_graph_ros.cli.run.document import Told
 from pose_graph_ros.cli.run.findings import Finding, MANY, MOST_SHOWN
 from pose_graph_ros.cli.run.sources import source_entry, SourceAnalysis, verdict
+from pose_graph_ros.cli.solved_graph import SolvedGraph
 from pose_graph_ros.core.batch.optimizer import optimize, Status
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -49,7 +50,7 @@ def solved_document(path: Path, edge2: str | None, robust: str | None) -> dict[s
         robust=robust, closure_sigma=BELIEF.closure_floors[::2], start='chordal',
         certificate=True, json=False), lambda _: None)
     graph, result = problem.engine, found.solution.result
-    solved = solved_graph(problem, before, chi2, result, found.doubted)
+    solved = problem.solved(before, chi2, result, found.doubted)
     ids, factors = solved.ids, solved.factors
     stamps = NANOSECONDS * (ids if np.all(np.abs(ids) < MOST_IDS) else np.arange(len(ids)))
     # a landmark has no place in the order of poses, and is seen from one
