@@ -14,7 +14,8 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -232,17 +233,18 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
             'errors': [asdict(row) for row in drive.rows], **extra}
 
 
-Measured = tuple[str, ms.OdometrySample | ms.Measurement, bool]
-"""A measurement after its source, and whether it is kept out of the graph."""
+class Recorded(NamedTuple):
+    """A measurement of a recording."""
+
+    source: str
+    measurement: ms.OdometrySample | ms.Measurement
+    held_out: bool = False  # of the graph
+    height: float = math.nan  # of the pose of odometry [m], NaN if unknown
 
 
 def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
-                *, held_out: bool, heights: 'array[float] | None' = None) -> Iterator[Measured]:
-    """
-    Yield the valid measurements of a bag, with those that are held out if they are wanted.
-
-    The height of each pose of the first odometry is added to the heights, NaN if it has no pose.
-    """
+                *, held_out: bool) -> Iterator[Recorded]:
+    """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
     start_ns: StampNs | None = None
     for source, message, is_held_out in read_inputs(bag, inputs):
         if is_held_out and not held_out:
@@ -257,16 +259,14 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
             continue
         if isinstance(measurement, ms.OdometrySample):
             start_ns = measurement.stamp_ns if start_ns is None else start_ns
-            if heights is not None and source == inputs.odometry[0]:
-                heights.append(content.pose.pose.position.z
-                               if inputs.kinds[source] is ODOMETRY else np.nan)
         is_in_stretch = (
             inputs.stretch is not None and start_ns is not None
             and isinstance(measurement, ms.Fix | ms.GlobalPose | ms.Position) and noise.is_in_part(
                 measurement.stamp_ns, start_ns, inputs.stretch, inputs.hold_out - 1,
                 inputs.hold_out))
         if held_out or not is_in_stretch:
-            yield source, measurement, is_held_out or is_in_stretch
+            yield Recorded(source, measurement, is_held_out or is_in_stretch, (
+                content.pose.pose.position.z if inputs.kinds[source] is ODOMETRY else math.nan))
 
 
 def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
@@ -282,33 +282,29 @@ def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseG
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    heights = array('d')
-    drive = collect_drive(
-        measured_in(bag, inputs, reader, Counter(), held_out=True, heights=heights), backend,
-        inputs.odometry[0], refused, heights)
+    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+                          inputs.odometry[0], refused)
     drive = replace(drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
                     damage=[*bag.damage.values()])
     return with_truth(drive, truth, truth.read(bag, inputs.span, reader.datum.plane))
 
 
-def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
-                  odometry_source: str, refused: Collection[Key] | None,
-                  heights: 'array[float] | None' = None) -> Drive:
+def collect_drive(measurements: Iterable[Recorded], backend: PoseGraphBackend,
+                  odometry_source: str, refused: Collection[Key] | None) -> Drive:
     """
     Return the path of an engine together with the measurements that it is made of.
 
     Loop closures without a verdict are believed but for those that were `refused`; None if it is
-    not known which: then all of sources that are judged. The heights of odometry may come in as
-    its samples are asked for.
+    not known which: then all of sources that are judged.
     """
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
     loops, sources, held = list[Key](), list[str](), list[bool]()
-    odometry = array('q'), array('d')
+    odometry = array('q'), array('d'), array('d')
     fixes = list[ms.Fix | ms.GlobalPose | ms.Position]()
     arrived: dict[str, array[int]] = {}
-    for source, measurement, held_out in measurements:
+    for source, measurement, held_out, height in measurements:
         arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
             case ms.Fix() | ms.GlobalPose() | ms.Position():
@@ -320,6 +316,7 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
             case ms.OdometrySample(stamp, pose) if source == odometry_source:
                 odometry[0].append(stamp)
                 odometry[1].extend(pose)
+                odometry[2].append(height)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
     arms = np.array([np.zeros(2) if isinstance(each, ms.GlobalPose) else each.lever_arm
                      for each in fixes]).reshape(-1, 2)
@@ -346,10 +343,10 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
         # of several with one stamp the first one was added
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     refused = {key for key in loops if key[0] in judged} if refused is None else refused
-    path, known_heights = path_of(*odometry, heights or array('d'))
+    path, heights = path_of(*odometry)
     return Drive(
         path, corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
-        [source for source, _, _ in loops], arrived_ns=arrived, odometry_heights=known_heights)
+        [source for source, _, _ in loops], arrived_ns=arrived, odometry_heights=heights)

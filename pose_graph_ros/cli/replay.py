@@ -26,7 +26,14 @@ from pose_graph_ros.adapters.conversions import Datum, frame
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, FULL, ON_EARTH
-from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in, with_truth
+from pose_graph_ros.cli.drive import (
+    collect_drive,
+    Drive,
+    drive_in,
+    measured_in,
+    Recorded,
+    with_truth,
+)
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import document, Recorder, Run, Update
 from pose_graph_ros.cli.truth import truth_of
@@ -330,7 +337,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
                     for each in read_measurements(options.bags[0], options.edge2)]
     result = run(measurements, values)
     drive = collect_drive(
-        ((*each, False) for each in measurements), result.backend, odometry, result.refused)
+        (Recorded(*each) for each in measurements), result.backend, odometry, result.refused)
     drive = with_truth(drive, truth, truth.read(None))
     samples = [(each.stamp_ns, _pose(each)) for _, each in measurements
                if isinstance(each, OdometrySample)]

@@ -128,4 +128,4 @@ def path_of(samples: 'array[int]', poses: 'array[float]', heights: 'array[float]
         stride *= 2
     stamps, first = np.unique(np.array(samples)[::stride], return_index=True)
     return (Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first]),
-            np.array(heights)[::stride][first] if len(heights) > 0 else np.zeros(0))
+            np.array(heights)[::stride][first])

@@ -14,7 +14,7 @@ from run_schema import problems
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, GYRO, LOOP_CLOSURE, ODOMETRY
-from pose_graph_ros.cli.drive import collect_drive, place_truth
+from pose_graph_ros.cli.drive import collect_drive, place_truth, Recorded
 from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.run import MOST_UPDATES, Recorder, Run, thinned, Update
 from pose_graph_ros.cli.run.document import document
@@ -31,7 +31,7 @@ def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     values = checked(dict(settings))
     backend, report, _, recorder, _ = run(drive.measurements(), values)
     compared = place_truth(replace(collect_drive(
-        ((*each, False) for each in drive.measurements()), backend, 'odom', ()),
+        (Recorded(*each) for each in drive.measurements()), backend, 'odom', ()),
         truth=drive.truth))
     kinds = {'odom': ODOMETRY, 'global_pose': GLOBAL_POSE, 'loop_closure': LOOP_CLOSURE}
     # as it is read from the file
