@@ -33,7 +33,7 @@ zstd = storage_mcap.zstd
 
 ROS1_SUFFIXES = '.bag', '.active'     # `record` adds the second one until it has ended
 LONGEST_CHUNK = 2**30   # as much is made of one at most [bytes]
-MISSING_NS = 100_000_000  # less than this at the end is not told as missing [ns]
+MISSING_NS = 100_000_000  # a bag that ends less than this too early counts as whole [ns]
 NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 # Kinds of records of an mcap file, and what they begin with.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = range(2, 7)
@@ -50,9 +50,11 @@ _DECOMPRESSORS = {'zstd': zstd.ZstdDecompressor, 'lz4': LZ4FrameDecompressor,
                   'bz2': BZ2Decompressor}
 _ZSTD = b'\x28\xb5\x2f\xfd'    # begin of a message that was compressed; CDR begins otherwise
 Connect = Callable[..., Connection]
-"""Return the connection of the copy, by its topic, type, form, definition and quality of service.
+"""
+Return the connection of the copy by topic, type, form, definition of the type, and quality.
 
-The form is the encoding, of ROS 1 the MD5 sum of the type; and the quality whether it is latched.
+The form is the serialization format of ROS 2, or the MD5 sum of a type of ROS 1; the quality is a
+list of QoS profiles of ROS 2, or whether a topic of ROS 1 is latched.
 """
 _Message = tuple[Connection, int, bytes]    # and when it was recorded [ns]
 

@@ -55,7 +55,7 @@ STYLE: Any = {
     # the renderer keeps all pixels that a piece of a line touches, each time it does
     'agg.path.chunksize': 1000}
 ERRORS = ListedColormap(colormaps['YlOrRd'](np.linspace(0.3, 1.0, 256)))
-LEAST_ERROR = 0.1  # that has the darkest colour [sigma]
+LEAST_ERROR = 0.1  # at least this error has the darkest colour [sigma]
 MOST_LINES = 5000  # of each kind that an SVG picture has as lines, not as pixels
 
 

@@ -349,7 +349,7 @@ class Optimised(NamedTuple):
 
 def optimised(problem: Problem, options: argparse.Namespace,
               say: Callable[[str], None]) -> Optimised:
-    """Solve a graph in place by `robust`, `closure_sigma`, `start`, `certificate` and `json`."""
+    """Solve a graph in place, by the options for how to start, what to doubt and to certify."""
     begin, start = time.monotonic(), options.start
     doubted, decision, certificate, proof = np.empty(0, np.int64), None, None, list[str]()
     if options.robust is not None:

@@ -28,7 +28,7 @@ from pose_graph_ros.core.quantities import Radians
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
 LONGEST_GAP_NS = 2 * 10**9  # between true poses, within which a robot moves nearly straight
-LEAST_ALIGNED = 3  # fewer places fit any path that has their distances
+LEAST_ALIGNED = 3  # two places can be moved onto any path with their distance
 POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 

@@ -28,7 +28,7 @@ from pose_graph_ros.core.sources.gyro import CONTRADICTORY
 LEVELS = ('warning', 'notice', 'good')
 MOST_SILENCES = 20  # of a source that are looked at
 MOST_TOLD = 3  # stretches and gaps that are told one by one
-MOST_SHOWN = 100  # closures that the map marks for a sentence
+MOST_SHOWN = 100  # closures that the map marks for one finding
 MANY = 3  # measurements that are more than bad luck
 
 

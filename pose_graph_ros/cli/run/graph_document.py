@@ -3,8 +3,8 @@
 """
 A graph from a file at its optimum as run.json: what `pose-graph report graph.g2o` makes a page of.
 
-What is a time in that of a run is here the id of a node: nodes are as poses at seconds. The poses
-as read stand for odometry.
+It has ids of nodes in place of times: node 7 is like a pose at 7 s. The poses as read are in the
+place of odometry.
 """
 
 import argparse
