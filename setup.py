@@ -89,6 +89,8 @@ setup(
         'PyYAML>=6.0',
     ],
     extras_require={
+        # for `pose-graph fleet` alone; bokeh draws the dashboard of Dask
+        'fleet': ['dask[distributed]>=2024.8', 'pyarrow>=14', 'bokeh>=3.1'],
         'test': ['pytest>=7.4', 'pytest-timeout>=2.2', 'pytest-xdist>=3.4', 'coverage>=7.4',
                  'hypothesis>=6.98', 'evo>=1.38', 'playwright>=1.40'],
         'dev': ['ruff', 'mypy', 'scipy-stubs'],

@@ -88,7 +88,7 @@ install_package() { # and, beside ROS, what it needs
 
 install_tools() {
     if [ "$VENV" = .venv ]; then install -r requirements-test.lock
-    else pip install -c "$VENV/constraints.txt" -e '.[test,dev]'; fi
+    else pip install -c "$VENV/constraints.txt" -e '.[test,dev,fleet]'; fi
 }
 
 # The wheels have neither tf2_msgs nor robot_localization, but what makes Python modules of messages.

@@ -32,7 +32,7 @@ def test_no_package_is_in_both_locks() -> None:
 
 def test_what_runs_the_node_comes_without_tests_and_linters() -> None:
     assert asked_for(RUNS) <= RUN
-    assert asked_for(TESTS) - {'test', 'dev'} <= TEST
+    assert asked_for(TESTS) - {'fleet', 'test', 'dev'} <= TEST
     assert not {name for name in RUN if name.startswith(('colcon', 'pytest'))}
 
 
