@@ -24,7 +24,8 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 
 TOOLS = {declare.__name__.replace('_', '-'): declare for declare in (
     arguments.demo, arguments.replay, arguments.solve, arguments.report, arguments.draw,
-    arguments.marginalize, arguments.tune, arguments.migrate, simulation_options.simulate,
+    arguments.marginalize, arguments.tune, arguments.fleet, arguments.migrate,
+    simulation_options.simulate,
     arguments.parameters, arguments.compile_kernels)}
 """Tools and what adds their arguments, whose docstrings say what they do."""
 RETRY = 0.01  # after which an interrupt is tried again [s]

@@ -10,7 +10,7 @@ bag, a copy with the path, odometry in the map, and the transform to odom.
 import argparse
 import bisect
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from pose_graph_ros.adapters import bags, output_cdr, sources
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, Inputs, MessageError, reader_of
 from pose_graph_ros.adapters.conversions import Datum, frame
+from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, FULL, ON_EARTH
@@ -274,23 +275,62 @@ def run(measurements: Iterable[tuple[str, Measured]], values: Values,
     return Replayed(backend, report, backend.counts, recorder, time.monotonic() - start)
 
 
+class Finished(NamedTuple):
+    """A replay at its end, and what only some of its files are made of."""
+
+    run: Run
+    facts: Mapping[str, Any]
+    datum: Datum | None = None
+    live: LivePoses | None = None
+    full: Trajectory | None = None
+
+
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
+    done = replayed(options, shared.given_parameters(options), _silent if options.json else print)
+    run, (datum, live, full) = done.run, done[2:]
+    lines = document.write_results(run, options.out, done.facts)
+    g2o.write_g2o(run.backend.graph, options.out / 'graph.g2o')
+    exported = write_exports(options.export, options.out, run, datum, full)
+    if live is not None:
+        exported.append(options.out / 'live.csv')
+        poses = np.array([each.T_map_base for each in live.values()]).reshape(-1, 3)
+        covariances = np.array([each.covariance for each in live.values()]).reshape(-1, 3, 3)
+        write_lines(exported[-1], path_files.csv_lines(
+            Trajectory(np.array([*live], dtype=np.int64), poses), covariances))
+    names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
+    print((options.out / 'summary.json').read_text(encoding='utf-8').rstrip('\n') if options.json
+          else '\n'.join([*lines, f'written: {options.out}/path.tum, {", ".join(names)}']))
+    return 0 if run.report.status is Status.CONVERGED else 1
+
+
+def _silent(_: str) -> None:
+    """Tell nobody."""
+
+
+def replayed(options: argparse.Namespace, given: Values,
+             tell: Callable[[str], None] = _silent) -> Finished:
+    """
+    Return what comes of bags, or of a g2o file, with the parameters that are given.
+
+    It tells which topics it reads. Files are not written, but for the bag that `--bag` asks for.
+    """
     is_graph = any(path.suffix in GRAPH_SUFFIXES for path in options.bags)
-    return _execute_g2o(options) if is_graph else _execute_bags(options)
+    return _replayed_graph(options, given) if is_graph else _replayed_bags(options, given, tell)
 
 
-def _execute_bags(options: argparse.Namespace) -> int:
+def _replayed_bags(options: argparse.Namespace, given: Values,
+                   tell: Callable[[str], None]) -> Finished:
     """Replay bags."""
-    values, truth = shared.parameter_values(options), truth_of(options)
+    values, truth = checked(given), truth_of(options)
     with ExitStack() as stack:
         bag = stack.enter_context(bags.open_bag(*options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out, options.stretch)
         require_datum(options.export, known=len(values['datum']) > 0 or len(inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
             BagWriter(options.new_bag, latched=LATCHED))
-        if not options.json:
-            print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
+        for source, topic in inputs.topics.items():
+            tell(f'{source}: {topic}')
         reader, refused = reader_of(bag, values), Counter[tuple[str, str]]()
         live: LivePoses | None = {} if options.live else None
         result = run((each[:2] for each in measured_in(
@@ -319,17 +359,17 @@ def _execute_bags(options: argparse.Namespace) -> int:
         if writer is not None:
             facts['new_bag'] = write_corrected(
                 writer, shared.watched_bag(bag, 'writing the bag'), inputs, done)
-    return _report(options, done, facts, reader.datum, live, full=full)
+    return Finished(done, facts, reader.datum, live, full)
 
 
-def _execute_g2o(options: argparse.Namespace) -> int:
+def _replayed_graph(options: argparse.Namespace, given: Values) -> Finished:
     """Replay a g2o file."""
     if len(options.bags) > 1 or any((options.new_bag, options.live, options.begin, options.until,
                                      options.hold_out, options.stretch)):
         raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
                        '--from, --until and --hold-out')
     require_datum(options.export, known=False)
-    values, truth = shared.parameter_values(options, {'odom.noise': 'twist'}), truth_of(options)
+    values, truth = checked({'odom.noise': 'twist', **given}), truth_of(options)
     if truth.topic is not None:
         raise BagError(f'--truth {truth.topic}: {options.bags[0]} has no topics; name a file')
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
@@ -342,10 +382,10 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     samples = [(each.stamp_ns, _pose(each)) for _, each in measurements
                if isinstance(each, OdometrySample)]
     path, is_full = drive.corrected, FULL in options.export.formats
-    return _report(options, _run_of(options, result, drive, values, {
-        odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}), {'seconds': result.seconds},
-        full=path.filled(PathCorrection(path, interpolated(path, samples)), samples)
-        if is_full else None)
+    done = _run_of(options, result, drive, values, {
+        odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE})
+    return Finished(done, {'seconds': result.seconds}, full=path.filled(
+        PathCorrection(path, interpolated(path, samples)), samples) if is_full else None)
 
 
 def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
@@ -353,22 +393,3 @@ def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values:
     return Run(options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
                drive, result.backend, result.recorder, values, kinds, result.counts,
                result.report, result.seconds)
-
-
-def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
-            datum: Datum | None = None, live: LivePoses | None = None, *,
-            full: Trajectory | None = None) -> int:
-    """Write the results and print a summary; return the exit code."""
-    lines = document.write_results(done, options.out, facts)
-    g2o.write_g2o(done.backend.graph, options.out / 'graph.g2o')
-    exported = write_exports(options.export, options.out, done, datum, full)
-    if live is not None:
-        exported.append(options.out / 'live.csv')
-        poses = np.array([each.T_map_base for each in live.values()]).reshape(-1, 3)
-        covariances = np.array([each.covariance for each in live.values()]).reshape(-1, 3, 3)
-        write_lines(exported[-1], path_files.csv_lines(
-            Trajectory(np.array([*live], dtype=np.int64), poses), covariances))
-    names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
-    print((options.out / 'summary.json').read_text(encoding='utf-8').rstrip('\n') if options.json
-          else '\n'.join([*lines, f'written: {options.out}/path.tum, {", ".join(names)}']))
-    return 0 if done.report.status is Status.CONVERGED else 1

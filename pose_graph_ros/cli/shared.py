@@ -9,6 +9,7 @@ from dataclasses import replace
 import math
 from pathlib import Path
 import sys
+import threading
 from typing import Any, TypeVar
 
 from pose_graph_ros.adapters import bags
@@ -27,9 +28,14 @@ def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
     return {source: getattr(options, source) for source in bags.OPTIONS}
 
 
-def parameter_values(options: argparse.Namespace, usual: Values | None = None) -> dict[str, Any]:
+def parameter_values(options: argparse.Namespace) -> dict[str, Any]:
     """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
-    given = {**(usual or {}), **_read_file(options.params_file)}
+    return checked(given_parameters(options))
+
+
+def given_parameters(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters that the options set, not yet checked; raises `ConfigError`."""
+    given = _read_file(options.params_file)
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':
@@ -38,7 +44,7 @@ def parameter_values(options: argparse.Namespace, usual: Values | None = None) -
             given[name] = yaml_value(value)
         except ValueError as error:
             raise ConfigError(f'--param {name}: {value!r} is not YAML') from error
-    return checked(given)
+    return given
 
 
 def ros_arguments(options: argparse.Namespace) -> list[str]:
@@ -106,7 +112,8 @@ def check_stretch(path: str, stretch: Seconds | None, duration: Seconds, parts: 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
     """Return the same items, with a bar on standard error if that is a terminal."""
-    if not sys.stderr.isatty():
+    # a thread is one of several that would draw over each other
+    if not sys.stderr.isatty() or threading.current_thread() is not threading.main_thread():
         return items
     from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
 

@@ -19,8 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.drive import Drive
+from pose_graph_ros.cli.drive import consistency, Drive
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Points
@@ -112,6 +113,20 @@ class Run:
             return self.backend.path_covariances(self.estimate)
         except ValueError as error:
             raise PoseGraphError(f'there are no covariances: {error}') from error
+
+    @cached_property
+    def degrees_of_freedom(self) -> int:
+        """Measured coordinates with a weight, less unknowns."""
+        graph = self.backend.graph
+        information = graph.factors_by_row.information[graph.weights > 0.0]
+        return int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0)) - int(
+            np.sum(graph.dimension[~graph.fixed]))
+
+    @cached_property
+    def consistency(self) -> dict[str, dict[str, Any] | None]:
+        """NEES of positions and poses, for JSON; empty without a truth or a solution."""
+        return {} if self.drive.truth is None or self.report.status is Status.FAILED else (
+            consistency(self.drive, self.covariances))
 
 
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:

@@ -21,7 +21,6 @@ from pose_graph_ros.cli.drive import BELIEVED, distances, Drive, extent, HELD_OU
 from pose_graph_ros.cli.run import Frame, number, rounded, Run, thinned
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import Covariances, IntArray, wrap
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -134,11 +133,6 @@ def _facts(run: Run) -> list[dict[str, str]]:
     estimate, drive = run.estimate, run.drive
     duration, travelled = extent(drive.corrected)
     longest = max((each.milliseconds for each in run.recorder.updates), default=None)
-    graph = run.backend.graph
-    information = graph.factors_by_row.information[graph.weights > 0.0]
-    # measured coordinates with a weight, less unknowns
-    freedom = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0)) - int(
-        np.sum(graph.dimension[~graph.fixed]))
     minutes, seconds = divmod(round(duration), 60)
     clock = f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
         minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
@@ -149,7 +143,7 @@ def _facts(run: Run) -> list[dict[str, str]]:
          f'{estimate.n_frozen} of them have left the window'),
         ('edges', str(estimate.n_edges), 'between poses'),
         ('measurements', str(estimate.n_observed), 'in the map, in the graph'),
-        ('chi2', f'{estimate.chi2:.5g}', f'{freedom} degrees of freedom'),
+        ('chi2', f'{estimate.chi2:.5g}', f'{run.degrees_of_freedom} degrees of freedom'),
         ('alignment', estimate.alignment.value, 'of odometry with the map'),
         ('optimisation', run.report.status.value.replace('_', ' '),
          f'{run.report.iterations} iterations at the end')]
@@ -170,15 +164,19 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     # matplotlib takes half a second to load, and wrong input needs none of it
     from pose_graph_ros.cli.picture import draw_drive  # noqa: PLC0415
 
+    told = write_files(run, folder, facts)
+    draw_drive(run.drive, folder / 'drive.png', run.title)
+    return _lines_for_people(run, facts, told)
+
+
+def write_files(run: Run, folder: Path, facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the object in run.json, after writing path.tum, summary.json and run.json."""
     drive, estimate, backend, report = run.drive, run.estimate, run.backend, run.report
     folder.mkdir(parents=True, exist_ok=True)
     write_tum(drive.corrected, folder / 'path.tum')
-    draw_drive(drive, folder / 'drive.png', run.title)
     totals = backend.verdict_totals()
     counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
     calibrations = {source: each._asdict() for source, each in backend.calibrations().items()}
-    nees = {} if drive.truth is None or report.status is Status.FAILED else drives.consistency(
-        drive, run.covariances)
     # counts of each source, and all closures and all that is not believed
     judged = {'sources': {source: {
         'states': {state.value: each.counts.get(state, 0) for state in texts.ORDER},
@@ -186,7 +184,7 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
             texts.as_json(each) for each in run.verdicts if each.kind is Judged.LOOP_CLOSURE
             or texts.is_notable(each)]}
     text = json.dumps(drives.summary(drive, {
-        **facts, **{f'nees_{name}': each for name, each in nees.items()},
+        **facts, **{f'nees_{name}': each for name, each in run.consistency.items()},
         **({'calibrations': calibrations} if len(calibrations) > 0 else {}),
         'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
@@ -198,6 +196,12 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     told = document(run)
     text = json.dumps(told, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
     (folder / FILE).write_text(text + '\n', encoding='utf-8')
+    return told
+
+
+def _lines_for_people(run: Run, facts: Mapping[str, Any], told: Mapping[str, Any]) -> list[str]:
+    drive, estimate, report = run.drive, run.estimate, run.report
+    counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
     lines = [f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
              f'observed nodes in {run.seconds:.2f} s; {report.status.value}, chi2 '
              f'{report.chi2:.6g}; {estimate.alignment.value}']
@@ -212,7 +216,8 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
             f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
             f'turns {short(math.sqrt(errors.turn), 3)} times what it claims',
             ' and '.join(corrected)))))
-    lines += [f'{source}: {texts.totals_text(each)}' for source, each in totals.items()]
+    lines += [f'{source}: {texts.totals_text(each)}'
+              for source, each in run.backend.verdict_totals().items()]
     lines += [f'{each["level"]:8} {each["text"]}' for each in told['findings']]
     if 'new_bag' in facts:
         lines.append('new bag: {original} messages copied, {left_out} left out, {corrected} poses '
@@ -228,7 +233,7 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
                 f'{each["mean"]:.4g}, expected {each["expected"]}, {each["interval"][0]:.4f} '
                 f'to {each["interval"][1]:.4f} if '
                 f'errors were independent; {100.0 * each["within"]:.1f} % below '
-                'the 95 % quantile')) for name, each in nees.items()), '']
+                'the 95 % quantile')) for name, each in run.consistency.items()), '']
 
 
 # --- the map
