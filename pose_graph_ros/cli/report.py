@@ -5,32 +5,21 @@ Make one HTML page of a run: map, errors, residuals by source, what is doubted a
 
 So it does of a graph that it solves, and of what differs between two runs.
 
-The data of the run, style and script are in it, and it asks no network for anything. In `page/`,
-the end of `sections.js` lists the sections, colours are in `report.css`, and `vendor/` has uPlot
-and Leaflet as they are published, with their licences.
-
-Titles, ids and reasons come from files and topics, so none of them is trusted: in the page they
-are JSON in which no tag can begin, and the script shows them as text only. The policy of the page
-(Content-Security-Policy) allows these scripts and this style by their hashes, and nothing from
-anywhere.
+How such a page is put together is in `html_page.py`; the end of `page/sections.js` lists its
+sections.
 """
 
 import argparse
-import base64
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-import hashlib
-import html
-from importlib.resources import files
 import io
 import json
 from pathlib import Path
-import re
 from typing import Any
 import webbrowser
 
 from pose_graph_ros.adapters import bags
-from pose_graph_ros.cli import arguments, replay
+from pose_graph_ros.cli import arguments, html_page, replay
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES
 from pose_graph_ros.cli.run.comparison import compared
 from pose_graph_ros.cli.run.document import FILE, read_document
@@ -42,6 +31,8 @@ OF_REPLAY = ('begin', 'until', 'params_file', 'truth', 'align', *bags.OPTIONS,
              'param', 'hold_out', 'stretch')  # of bags alone
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = (*bags.BAG_FILE_SUFFIXES, '.g2o', '.graph')
+SCRIPTS = ('base', 'chart', 'paint', 'map', 'sections')
+LIBRARIES = ('uPlot', 'leaflet')
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -132,49 +123,7 @@ def _refuse_options(options: argparse.Namespace, files: Sequence[Path | None]) -
             f'{first} is solved as it is; replay it first to use the option'))
 
 
-SCRIPTS = ('base', 'chart', 'paint', 'map', 'sections')
-"""Parts of the script, in order; they share one scope."""
-LIBRARIES = {'uPlot': ('uPlot.iife.min.js', 'uPlot.min.css'),
-             'leaflet': ('leaflet.js', 'leaflet.css')}
-"""Script and style of the libraries of others in vendor/, with their licences beside them."""
-# Paper has more pixels than most screens; the libraries ask once, as they are loaded.
-SHARP = ("Object.defineProperty(window, 'devicePixelRatio', "
-         '{value: Math.max(2, devicePixelRatio), configurable: true});')
-ESCAPES = {ord(sign): f'\\u{ord(sign):04x}' for sign in '<>&'}
-"""Signs that begin a tag, a comment or an entity, as JSON may spell them in texts."""
-
-
 def render(data: Mapping[str, Any]) -> str:
     """Return the page for the data of a report as HTML; ValueError if a number is not finite."""
-    parts = {
-        'library': '\n'.join((SHARP, *(_vendored(name, 0) for name in LIBRARIES))),
-        'script': '\n'.join(("\n'use strict';", *(_asset(f'{name}.js') for name in SCRIPTS))),
-        'style': '\n'.join((*(_vendored(name, 1) for name in LIBRARIES), _asset('report.css'))),
-        'data': json.dumps(data, allow_nan=False, separators=(',', ':')).translate(ESCAPES),
-        # half a surrogate pair, which no file can hold, becomes a question mark
-        'title': html.escape(str(data.get('title') or 'report').encode(
-            'utf-8', 'replace').decode('utf-8')),
-    }
-    parts['policy'] = (
-        f"default-src 'none'; script-src {_hash(parts['library'])} {_hash(parts['script'])}; "
-        f"style-src {_hash(parts['style'])}; img-src data:; base-uri 'none'; form-action 'none'")
-    # one pass, so that what is put in is not looked at again
-    return re.sub(r'{{(\w+)}}', lambda found: parts[found[1]], _asset('report.html'))
-
-
-def _asset(name: str) -> str:
-    return (files(__package__) / 'page' / name).read_text(encoding='utf-8')
-
-
-def _vendored(library: str, which: int) -> str:
-    """Return the script (0) or the style (1) of a library after its licence."""
-    text = _asset(f'vendor/{LIBRARIES[library][which]}')
-    # of the map of its source only the developer's tools of a browser would ask
-    text = text.partition('//# sourceMappingURL')[0]
-    return text if which == 1 else f'/*\n{_asset(f"vendor/LICENSE.{library}")}*/\n{text}'
-
-
-def _hash(text: str) -> str:
-    """Return how a policy names a script or a style."""
-    digest = hashlib.sha256(text.encode('utf-8')).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+    return html_page.page(data, f'{data.get("title") or "report"} - pose-graph report', SCRIPTS,
+                          LIBRARIES)

@@ -2,18 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a report in a real browser: what a reader sees, clicks and is told."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 import itertools
 import json
-import os
 from pathlib import Path
 import re
-import shutil
-import subprocess
 import time
 from typing import Any
 
+from browser_pages import NARROW, Opened, Opener, WIDE
 from false_loops import laps
 import numpy as np
 import pytest
@@ -27,10 +25,8 @@ from pose_graph_ros.cli.run.graph_document import solved_document
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.io.g2o import write_g2o
 
-BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
-WIDE, NARROW = 1400, 400
 HOSTILE = '</script><img src=x onerror="window.hacked=1"><!--\u2028{{data}}&amp;$&'
-CSS = (Path(pose_graph_ros.__file__).parent / 'cli' / 'page' / 'report.css').read_text('utf-8')
+CSS = (Path(pose_graph_ros.__file__).parent / 'cli' / 'page' / 'page.css').read_text('utf-8')
 
 # A hash of the pictures of the map.
 HASH = """() => {
@@ -46,13 +42,8 @@ HASH = """() => {
 }"""
 
 
-@dataclass
-class Opened:
-    """A page, and what went wrong or left the machine while it was open."""
-
-    page: Any
-    troubles: list[str] = field(default_factory=list)
-    requests: list[str] = field(default_factory=list)
+class Report(Opened):
+    """The page of a report that is open."""
 
     def view(self) -> tuple[float, float, float]:
         """Return the middle of the map [m] and its scale [pixels / m]."""
@@ -74,51 +65,6 @@ class Opened:
         """Return a hash of the picture of the map."""
         self.settle()
         return int(self.page.evaluate(HASH))
-
-    def until(self, expression: str) -> None:
-        """Wait until an expression is true; what playwright has for this needs eval()."""
-        for _ in range(200):
-            if self.page.evaluate(expression):
-                return
-            self.page.wait_for_timeout(20)
-        pytest.fail(f'never: {expression}')
-
-    def settle(self) -> None:
-        """Wait until what was asked for has been painted."""
-        self.page.evaluate('new Promise((done) => requestAnimationFrame('
-                           '() => requestAnimationFrame(done)))')
-
-    def overflow(self) -> int:
-        return int(self.page.evaluate('document.scrollingElement.scrollWidth - innerWidth'))
-
-
-def executable() -> str:
-    # (Ubuntu's chromium-browser only says that there is a snap)
-    found = next((path for path in filter(None, map(shutil.which, BROWSERS)) if subprocess.run(
-        [path, '--version'], capture_output=True, check=False).returncode == 0), None)
-    if found is None:
-        missing('no browser; do: apt install chromium (on Ubuntu, google-chrome from its maker)')
-    return str(found)
-
-
-def missing(reason: str) -> None:
-    """Skip, or fail where continuous integration should have installed it."""
-    if os.environ.get('CI'):
-        pytest.fail(reason)
-    pytest.skip(reason)
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Any]:
-    try:
-        from playwright.sync_api import sync_playwright  # noqa: PLC0415
-    except ImportError:
-        missing('no playwright: pip install playwright')
-    with sync_playwright() as tool:
-        options = ['--no-sandbox'] if os.geteuid() == 0 else []
-        chromium = tool.chromium.launch(executable_path=executable(), args=options)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope='module')
@@ -160,40 +106,16 @@ def made() -> dict[str, Any]:
     return example()
 
 
-class Opener:
-    """Opens pages, and looks at the end whether they had troubles."""
-
-    def __init__(self, browser: Any, folder: Path) -> None:
-        self.browser, self.folder, self.opened = browser, folder, []
-
-    def __call__(self, data: dict[str, Any], width: int = WIDE, **options: Any) -> Opened:
-        file = self.folder / f'page{len(self.opened)}.html'
-        file.write_text(render(data), encoding='utf-8')
-        touch = {'has_touch': True, 'is_mobile': True} if width == NARROW else {}
-        context = self.browser.new_context(
-            viewport={'width': width, 'height': 900}, reduced_motion='reduce', **touch, **options)
-        opened = Opened(context.new_page())
-        opened.page.set_default_timeout(10_000)
-        opened.page.on('pageerror', lambda error: opened.troubles.append(str(error)))
-        opened.page.on('console', lambda message: opened.troubles.append(message.text))
-        opened.page.on('request', lambda request: opened.requests.append(request.url))
-        opened.page.goto(file.as_uri())
-        opened.settle()
-        self.opened.append(opened)
-        return opened
-
-    def close(self) -> None:
-        for opened in self.opened:
-            opened.page.context.close()
-            assert opened.troubles == []
-            assert [url for url in opened.requests if not url.startswith(('file:', 'data:'))] == []
-            assert len(opened.requests) <= 2        # itself, and its icon, which is empty
-
-
 @pytest.fixture
-def show(browser: Any, tmp_path: Path) -> Iterator[Opener]:
-    opener = Opener(browser, tmp_path)
-    yield opener
+def show(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Opened]]:
+    opener = Opener(browser, Report)
+
+    def shown(data: dict[str, Any], width: int = WIDE, **options: Any) -> Opened:
+        file = tmp_path / f'page{len(opener.opened)}.html'
+        file.write_text(render(data), encoding='utf-8')
+        return opener(file.as_uri(), width, **options)
+
+    yield shown
     opener.close()
 
 

@@ -1,6 +1,6 @@
 // Copyright 2026 The pose_graph_ros authors
 // SPDX-License-Identifier: Apache-2.0
-// What all parts of the page use: elements, colours, numbers as people read them, the looks of
+// What all parts of the pages use: elements, colours, numbers as people read them, the looks of
 // states, and the one place that knows which time and which measurement the reader looks at.
 
 const DATA = JSON.parse(document.getElementById('data').textContent);
@@ -48,9 +48,11 @@ const linkTo = (id, text) => make('a', {href: `#${encodeURIComponent(id)}`}, tex
 function table(look, heads, rows) {
   return make('div', {class: `scrolls ${look}`}, make('table', {},
     make('thead', {}, make('tr', {}, heads.map((text) => make('th', {scope: 'col'}, text)))),
-    make('tbody', {}, rows.map(([first, ...cells]) => make('tr', {},
-      make('th', {scope: 'row'}, first), cells.map((cell) => make('td', {}, cell)))))));
+    make('tbody', {}, rows.map(tableRow))));
 }
+
+const tableRow = ([first, ...cells]) => make('tr', {},
+  make('th', {scope: 'row'}, first), cells.map((cell) => make('td', {}, cell)));
 
 // --- colours ------------------------------------------------------------------------------------
 
@@ -58,7 +60,7 @@ function table(look, heads, rows) {
 const repaints = [];
 let palette = {};
 
-/** The value of a colour of report.css in the scheme that is shown. */
+/** The value of a colour of page.css in the scheme that is shown. */
 function colour(name) {
   if (name.startsWith('#')) return name;
   if (!(name in palette)) {
@@ -157,6 +159,16 @@ const LOOKS = [
 const [BELIEVED, WEAK, WAITING, DOUBTED, REFUSED, HELD_OUT] = LOOKS.keys();
 const lookOf = (state) => LOOKS[state] || LOOKS[0];
 
+const LEVELS = {
+  failed: ['Failed', 'M8,2a6,6 0 1,0 0.01,0Z M5.6,5.6L10.4,10.4M5.6,10.4L10.4,5.6'],
+  warning: ['Warning', 'M8,1.5L15,14H1Z M8,6V10 M8,11.6V12.4'],
+  notice: ['Notice', 'M8,2a6,6 0 1,0 0.01,0Z M8,7V11.4 M8,4.6V5.4'],
+  good: ['Good', 'M8,2a6,6 0 1,0 0.01,0Z M5,8.2L7.2,10.4L11.2,5.8']};
+
+/** The sign of a level. */
+const sign = (level) => draw('svg', {class: 'sign', viewBox: '0 0 16 16', 'aria-hidden': 'true'},
+  draw('path', {d: LEVELS[level][1]}));
+
 /** A small picture of a mark or of a line, for lists. */
 function swatch({colour: name, shape, dash, width, area, open}) {
   const stroke = `var(--${name})`;
@@ -190,3 +202,61 @@ function lookAtItem(item) {
   focus.spans = [];
   for (const follow of followers.item) follow(item);
 }
+
+// --- head, foot and paper -----------------------------------------------------------------------
+
+/** Which tool made the page, its title and what is below it, a button for the scheme, and facts. */
+function showTop(maker, subtitle) {
+  const root = document.documentElement;
+  const dark = matchMedia('(prefers-color-scheme: dark)');
+  const toggle = make('button', {type: 'button', id: 'scheme'});
+  const use = (name) => {
+    setScheme(name);
+    toggle.textContent = name === 'dark' ? 'Light' : 'Dark';
+    toggle.setAttribute('aria-label', `Show the page ${name === 'dark' ? 'light' : 'dark'}`);
+  };
+  const follow = () => use(dark.matches ? 'dark' : 'light');
+  toggle.addEventListener('click', () => {
+    dark.removeEventListener('change', follow);
+    use(root.dataset.scheme === 'dark' ? 'light' : 'dark');
+    remembered((store) => store.setItem('pose-graph-scheme', root.dataset.scheme));
+  });
+  const chosen = remembered((store) => store.getItem('pose-graph-scheme'));
+  if (chosen === 'dark' || chosen === 'light') use(chosen);
+  else {
+    dark.addEventListener('change', follow);
+    follow();
+  }
+  document.getElementById('head').append(
+    make('div', {class: 'title'}, make('p', {class: 'subtitle'}, maker),
+      make('h1', {}, DATA.title || 'report'), make('p', {class: 'subtitle'}, subtitle)), toggle);
+  document.getElementById('main').append(make('dl', {class: 'facts'}, (DATA.facts || []).map(
+    ({label, value, note}) => make('div', {class: 'card'}, make('dt', {}, label),
+      make('dd', {}, value), make('dd', {class: 'note'}, note || '')))));
+  document.getElementById('foot').append(make('p', {},
+    `Made by ${maker}. This file holds all its data, and loads nothing.`));
+}
+
+/** Ask what the browser keeps for the reader; some keep nothing for files, and raise an error. */
+function remembered(ask) {
+  try {
+    return ask(window.localStorage);
+  } catch {
+    return null;
+  }
+}
+
+// on paper a page is light and has all findings, whatever it is on the screen
+let [onScreen, folded] = [null, []];
+const print = (begins) => {
+  document.documentElement.classList.toggle('paper', begins);
+  if (begins) {
+    onScreen = document.documentElement.dataset.scheme;
+    folded = [...document.querySelectorAll('details.good:not([open])')];
+  }
+  for (const each of folded) each.open = begins;
+  for (const follow of followers.print) follow(begins);
+  setScheme(begins ? 'light' : onScreen);
+};
+window.addEventListener('beforeprint', () => print(true));
+window.addEventListener('afterprint', () => print(false));

@@ -2,57 +2,17 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is on the page, from top to bottom, but for the map.
 
-const LEVELS = {
-  warning: ['Warning', 'M8,1.5L15,14H1Z M8,6V10 M8,11.6V12.4'],
-  notice: ['Notice', 'M8,2a6,6 0 1,0 0.01,0Z M8,7V11.4 M8,4.6V5.4'],
-  good: ['Good', 'M8,2a6,6 0 1,0 0.01,0Z M5,8.2L7.2,10.4L11.2,5.8']};
 const timeAxis = (values) => ({label: DATA.by_node ? 'node' : `time [${clockUnit()}]`, values, time: true,
   range: [0, DATA.duration || 1]});
 const charts = (host, layout) => host.appendChild(make('div', {class: `charts ${layout}`}));
 
 /** Title, facts and findings. */
 function showHead() {
-  const root = document.documentElement;
-  const dark = matchMedia('(prefers-color-scheme: dark)');
-  const toggle = make('button', {type: 'button', id: 'scheme'});
-  const use = (name) => {
-    setScheme(name);
-    toggle.textContent = name === 'dark' ? 'Light' : 'Dark';
-    toggle.setAttribute('aria-label', `Show the page ${name === 'dark' ? 'light' : 'dark'}`);
-  };
-  const follow = () => use(dark.matches ? 'dark' : 'light');
-  toggle.addEventListener('click', () => {
-    dark.removeEventListener('change', follow);
-    use(root.dataset.scheme === 'dark' ? 'light' : 'dark');
-    remembered((store) => store.setItem('pose-graph-scheme', root.dataset.scheme));
-  });
-  const chosen = remembered((store) => store.getItem('pose-graph-scheme'));
-  if (chosen === 'dark' || chosen === 'light') use(chosen);
-  else {
-    dark.addEventListener('change', follow);
-    follow();
-  }
   const when = DATA.start ? `${DATA.start.slice(0, 10)} ${DATA.start.slice(11, 19)} UTC` : null;
-  document.getElementById('head').append(
-    make('div', {class: 'title'}, make('p', {class: 'subtitle'}, 'pose-graph report'),
-      make('h1', {}, DATA.title || 'report'),
-      make('p', {class: 'subtitle'}, [DATA.subtitle, when].filter((text) => text).join(' · '))),
-    toggle);
-  document.getElementById('main').append(make('dl', {class: 'facts'}, (DATA.facts || []).map(
-    ({label, value, note}) => make('div', {class: 'card'}, make('dt', {}, label),
-      make('dd', {}, value), make('dd', {class: 'note'}, note || '')))));
+  showTop('pose-graph report', [DATA.subtitle, when].filter((text) => text).join(' · '));
   showFindings();
   document.getElementById('contents').append(make('ul', {}, SHOWN.map(
     (id) => make('li', {}, linkTo(id, SECTIONS[id][0])))));
-}
-
-/** Ask what the browser keeps for the reader; some keep nothing for files, and raise an error. */
-function remembered(ask) {
-  try {
-    return ask(window.localStorage);
-  } catch {
-    return null;
-  }
 }
 
 /** What a person must know; what is as it should be is folded away, unless there is nothing else. */
@@ -62,7 +22,7 @@ function showFindings() {
   const list = (found) => make('ul', {class: 'findings'}, found.map(({level, text, anchor, at}) => {
     const name = level in LEVELS ? level : 'notice';
     return make('li', {'data-level': name},
-      draw('svg', {viewBox: '0 0 16 16', 'aria-hidden': 'true'}, draw('path', {d: LEVELS[name][1]})),
+      sign(name),
       make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[name][0]}: `), text),
       at && at.length > 0 ? make('a', {href: '#map', onclick: (event) => {
         event.preventDefault();
@@ -304,21 +264,6 @@ function showSparsity() {
   }
 }
 
-// on paper the page is light and has all findings, whatever it is on the screen
-let [onScreen, folded] = [null, []];
-const print = (begins) => {
-  document.documentElement.classList.toggle('paper', begins);
-  if (begins) {
-    onScreen = document.documentElement.dataset.scheme;
-    folded = [...document.querySelectorAll('details.good:not([open])')];
-  }
-  for (const each of folded) each.open = begins;
-  for (const follow of followers.print) follow(begins);
-  setScheme(begins ? 'light' : onScreen);
-};
-window.addEventListener('beforeprint', () => print(true));
-window.addEventListener('afterprint', () => print(false));
-
 let onMap = null;
 const SECTIONS = {
   map: ['Map', () => { onMap = showMap(); }], figures: ['Figures', showFigures],
@@ -331,5 +276,3 @@ const SHOWN = {graph: ['map', 'sources', 'springs', 'sparsity'],
   || ['map', 'errors', 'sources', 'springs', 'updates', 'sparsity'];
 showHead();
 SHOWN.forEach((id) => SECTIONS[id][1]());
-document.getElementById('foot').append(make('p', {},
-  'Made by pose-graph report. This file holds all its data, and loads nothing.'));

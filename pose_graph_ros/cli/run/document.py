@@ -30,6 +30,7 @@ from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
+from pose_graph_ros.core.quantities import Metres, Seconds
 from pose_graph_ros.offline import pattern as patterns
 from pose_graph_ros.offline.source_residuals import spread
 
@@ -133,12 +134,9 @@ def _facts(run: Run) -> list[dict[str, str]]:
     estimate, drive = run.estimate, run.drive
     duration, travelled = extent(drive.corrected)
     longest = max((each.milliseconds for each in run.recorder.updates), default=None)
-    minutes, seconds = divmod(round(duration), 60)
-    clock = f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
-        minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
-    metres = f'{travelled:.1f} m' if travelled < 1000.0 else f'{1e-3 * travelled:.2f} km'
     facts = [
-        ('duration', clock, ''), ('distance', metres, 'of the path'),
+        ('duration', duration_text(duration), ''),
+        ('distance', length_text(travelled), 'of the path'),
         ('hidden nodes', str(estimate.n_hidden), '' if estimate.n_frozen == 0 else
          f'{estimate.n_frozen} of them have left the window'),
         ('edges', str(estimate.n_edges), 'between poses'),
@@ -157,6 +155,18 @@ def _facts(run: Run) -> list[dict[str, str]]:
     if longest is not None:
         facts.append(('longest update', f'{longest:.1f} ms', f'of {run.recorder.n_updates}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
+
+
+def duration_text(duration: Seconds) -> str:
+    """Return a duration for people."""
+    minutes, seconds = divmod(round(duration), 60)
+    return f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
+        minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
+
+
+def length_text(length: Metres) -> str:
+    """Return a length for people."""
+    return f'{length:.1f} m' if length < 1000.0 else f'{1e-3 * length:.2f} km'
 
 
 def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]:
