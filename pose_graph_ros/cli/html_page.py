@@ -22,6 +22,8 @@ import json
 import re
 from typing import Any
 
+from pose_graph_ros.core.quantities import Metres, Seconds
+
 LIBRARIES = {'uPlot': ('uPlot.iife.min.js', 'uPlot.min.css'),
              'leaflet': ('leaflet.js', 'leaflet.css')}
 """Script and style of the libraries of others in vendor/, with their licences beside them."""
@@ -70,3 +72,15 @@ def _hash(text: str) -> str:
     """Return how a policy names a script or a style."""
     digest = hashlib.sha256(text.encode('utf-8')).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def duration_text(duration: Seconds) -> str:
+    """Return a duration for people."""
+    minutes, seconds = divmod(round(duration), 60)
+    return f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
+        minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
+
+
+def length_text(length: Metres) -> str:
+    """Return a length for people."""
+    return f'{length:.1f} m' if length < 1000.0 else f'{1e-3 * length:.2f} km'

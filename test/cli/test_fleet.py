@@ -264,7 +264,8 @@ def test_wrong_words_are_told_before_anything_is_done(
     (tmp_path / 'empty').mkdir()
     for words, expected in (
             ([bags, '--set', 'odom.sigma_distanc:=1'], 'error: parameter odom.sigma_distanc '),
-            ([bags, '--set', 'odom.sigma_distance:=-1.0'], 'error: parameter odom.sigma_distance: '),
+            ([bags, '--set', 'odom.sigma_distance:=-1.0'],
+             'error: parameter odom.sigma_distance: '),
             ([tmp_path / 'empty'], f'error: {tmp_path}/empty: no bag'),
             ([f'{tmp_path}/*.mcap'], f'error: {tmp_path}/*.mcap: no bag'),
             (['nothing://bags/*'], 'error: nothing://bags/*: '),

@@ -56,7 +56,8 @@ def show(browser: Any, tmp_path: Path) -> Iterator[Callable[..., Fleet]]:
 
     def shown(rows: list[dict[str, Any]], width: int = WIDE, *, at: str = '', title: str = 'fleet',
               subtitle: str = '12 bags', points: Any = (), **options: Any) -> Opened:
-        page = write_overview(shuffled(rows), tmp_path, title=title, subtitle=subtitle,
+        page = write_overview(shuffled(rows), tmp_path, lambda row: row['map'] or [],
+                              title=title, subtitle=subtitle,
                               points=points)
         assert page == tmp_path / 'index.html'
         assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ['index.html']
@@ -185,7 +186,7 @@ def test_a_click_opens_the_report_of_the_drive(show, tmp_path) -> None:
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_hostile_texts_are_shown_as_texts(show, width) -> None:
     points = [{'parameters': {HOSTILE: HOSTILE}, 'drives': 1, 'failed': 0, 'mean': 1.0,
-               'spread': None, 'worst': 1.0, 'better_by': None, 'standard_error': None}]
+               'spread': None, 'worst': 1.0, 'worse_by': None, 'standard_error': None}]
     opened = show([
         drive(HOSTILE + '\udcff', 1, bag=HOSTILE, finding=HOSTILE, parameters='{"</p>": "<b>"}'),
         failed(HOSTILE, HOSTILE, bag=HOSTILE * 9)], width, title=HOSTILE, subtitle=HOSTILE,
@@ -247,7 +248,7 @@ def test_it_is_printed_light_and_whole(show) -> None:
 
 def test_points_of_a_sweep_are_above_the_drives(show) -> None:
     point = {'drives': 12, 'failed': 1, 'mean': 0.4321, 'spread': 0.1, 'worst': 2.0,
-             'better_by': 0.05, 'standard_error': 0.012}
+             'worse_by': 0.05, 'standard_error': 0.012}
     points = [{'parameters': {'gps.sigma_scale': scale}, **point} for scale in (2.0, 1.0)]
     opened = show([drive('one', parameters='{"gps.sigma_scale": 2.0}')], points=points,
                   subtitle='score: rms to the truth [m]')

@@ -3,7 +3,7 @@
 """A call of the tool: what is missing is done, the rest is kept, and all is put together."""
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 import fcntl
@@ -21,9 +21,10 @@ from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.fleet import overview, sweep, table
 from pose_graph_ros.cli.fleet.kept import key_of, read_map, read_result, UNFINISHED
 from pose_graph_ros.cli.fleet.recordings import find_recordings, Recording, stamp_of
-from pose_graph_ros.cli.fleet.settings import OF_BAGS, Settings, write_aside
+from pose_graph_ros.cli.fleet.settings import OF_BAGS, Settings
 from pose_graph_ros.cli.fleet.sweep import Point, SCORES
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
+from pose_graph_ros.core.io.atomic_files import write_files
 
 CONTENTS = 'contents.json'  # digests of bags by path, with the stamps for which they hold
 HELD_OUT = 5  # of so many fixes one, if a sweep is to score them and nothing is said
@@ -103,11 +104,13 @@ class Results:
     def add(self, point: int, recording: Recording, row: Row) -> None:
         """Add the row of a drive."""
         values = self.points[point][0]
+        content = row.get('content', '')
+        row = row | {'name': recording.name, 'bag': recording.path,
+                     'is_new': bool(row.get('is_new')),
+                     'parameters': json.dumps(values) if len(values) > 0 else ''}
         self.found[point, recording.path] = {
-            **row, 'name': recording.name, 'bag': recording.path,
-            'is_new': bool(row.get('is_new')),
-            'parameters': json.dumps(values) if len(values) > 0 else ''}
-        if content := row.pop('content', ''):
+            each.name: row.get(each.name) for each in table.COLUMNS}
+        if content != '':
             stamp = _stamp(recording, self.points[point][1])
             self.contents[recording.path] = [stamp, content]
 
@@ -129,7 +132,7 @@ class Results:
 
     def keep_contents(self) -> None:
         """Write which contents bags have, so that they need not be read again."""
-        write_aside(self.out / CONTENTS, json.dumps(self.contents, indent=0) + '\n')
+        write_files({self.out / CONTENTS: json.dumps(self.contents, indent=0).encode()})
 
 
 def _stamp(recording: Recording, settings: Settings) -> str:
@@ -188,10 +191,10 @@ def _write(results: Results, options: argparse.Namespace) -> None:
         print('\n'.join(sweep.lines(found)))
         sweep.write(found, shared.given_parameters(options), options.score, out)
         written += [sweep.TABLE, sweep.BEST]
-    shown = overview.in_order(results.of_point(best))[:overview.MOST_ROWS]
     page = overview.write_overview(
-        [row | {'map': _map_of(out, row)} for row in shown], out, title=out.absolute().name,
-        subtitle=_subtitle(options), points=[each._asdict() for each in found])
+        results.of_point(best), out, lambda row: read_map(out, row['folder']),
+        title=out.absolute().name, subtitle=_subtitle(options),
+        points=[each._asdict() for each in found])
     counts = [('replayed', sum(row['is_new'] for row in rows)),
               ('kept', sum(not row['is_new'] and row['status'] != table.FAILED for row in rows)),
               ('failed', sum(row['status'] == table.FAILED for row in rows))]
@@ -210,13 +213,6 @@ def _subtitle(options: argparse.Namespace) -> str:
     if len(options.sweep) == 0:
         return ''
     return f'the best point of a sweep, by the error of the path ({options.score})'
-
-
-def _map_of(out: Path, row: Mapping[str, Any]) -> list[list[float]]:
-    try:
-        return read_map(out, row['folder']) if row['folder'] else []
-    except (OSError, ValueError, KeyError):
-        return []
 
 
 @contextmanager

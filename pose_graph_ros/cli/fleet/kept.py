@@ -38,7 +38,9 @@ def read_result(out: Path, key: str, run: str = '') -> dict[str, Any] | None:
 
 
 def read_map(out: Path, folder: str) -> list[list[float]]:
-    """Return the small map of a drive."""
-    points: list[list[float]] = json.loads(
-        (out / folder / FILE).read_text(encoding='utf-8'))['map']
-    return points
+    """Return the small map of a drive; nothing if there is none."""
+    with suppress(OSError, ValueError, KeyError):
+        points: list[list[float]] = json.loads(
+            (out / folder / FILE).read_text(encoding='utf-8'))['map']
+        return points
+    return []

@@ -6,7 +6,7 @@ Write the page of a fleet: drives as rows to sort and to filter, the worst first
 It links to the reports of the drives, which are beside it.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,12 +15,15 @@ from urllib.parse import quote
 import numpy as np
 
 from pose_graph_ros.cli import finite, html_page
-from pose_graph_ros.cli.run.document import duration_text, length_text
+from pose_graph_ros.cli.fleet.table import CONVERGED, FAILED, NOT_CONVERGED
+from pose_graph_ros.cli.html_page import duration_text, length_text
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.judgement.texts import short
 
 Row = Mapping[str, Any]
-STATUSES = ('failed', 'not converged', 'converged')
+Place = Sequence[float]
+"""x and y [m]."""
+STATUSES = (FAILED, NOT_CONVERGED, CONVERGED)  # worst first
 MOST = 10_000  # drives on the page
 MAP = (100, 64)  # width and height of a small one, in its own units; so they are in fleet.js
 SHOWN = (
@@ -40,15 +43,19 @@ def in_order(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return sorted((finite(dict(row)) for row in rows), key=rank)
 
 
-def write_overview(rows: Sequence[Row], out: Path, *, title: str, subtitle: str,
-                   points: Sequence[Row] = ()) -> Path:
-    """Write the page of drives, and of the points of a sweep, best first; return its path."""
+def write_overview(rows: Sequence[Row], out: Path, map_of: Callable[[Row], Sequence[Place]], *,
+                   title: str, subtitle: str, points: Sequence[Row] = ()) -> Path:
+    """
+    Write the page of drives, and of the points of a sweep, best first; return its path.
+
+    `map_of` is asked for some places along the path of a drive that is shown.
+    """
     ordered, path = in_order(rows), out / 'index.html'
     data = {'title': title, 'subtitle': subtitle, 'facts': [
         {'label': label, 'value': value, 'note': note} for label, value, note in _facts(ordered)],
         # so long that times are minutes and seconds
         'duration': max([120.0, *_known(ordered, 'duration_s')]),
-        'rows': [_told(row) for row in ordered[:MOST]], 'all': len(ordered),
+        'rows': [_told(row) | _map(map_of(row)) for row in ordered[:MOST]], 'all': len(ordered),
         'points': finite([dict(point) for point in points])}
     made = html_page.page(data, f'{title} - pose-graph fleet', ('base', 'fleet'))
     write_files({path: made.encode('utf-8')})
@@ -85,12 +92,11 @@ def _told(row: Row) -> dict[str, Any]:
     stamp = np.datetime64(row['start_ns'] or 0, 'ns')
     if stamp >= np.datetime64('2000'):  # before, stamps count from any beginning
         told['start'] = str(stamp)[:16].replace('T', ' ')
-    told |= _map(row['map'] or [])
     return {key: float(f'{value:.5g}') if isinstance(value, float) else value
             for key, value in told.items() if value not in (None, '')}
 
 
-def _map(places: Sequence[Sequence[float]]) -> dict[str, Any]:
+def _map(places: Sequence[Place]) -> dict[str, Any]:
     """Return a path in units of a small map, and its size [m]."""
     path = np.array(places, dtype=float).reshape(-1, 2)
     path = path[np.all(np.isfinite(path), axis=1)]

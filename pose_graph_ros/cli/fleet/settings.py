@@ -23,6 +23,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.io.atomic_files import write_files
 
 FOLDER = 'settings'
 OF_BAGS = ('begin', 'until', 'edge2', 'hold_out', 'stretch', 'align', 'truth', *OPTIONS)
@@ -58,10 +59,8 @@ class Settings:
 
     def write(self, out: Path) -> None:
         """Write the file that workers read."""
-        folder = out / FOLDER
-        folder.mkdir(parents=True, exist_ok=True)
-        write_aside(folder / f'{self.id}.json', json.dumps(
-            asdict(self) | {'options': dict(_plain(self.options))}, indent=1) + '\n')
+        write_files({out / FOLDER / f'{self.id}.json': json.dumps(
+            asdict(self) | {'options': dict(_plain(self.options))}, indent=1).encode()})
 
     def replay_options(self, bag: Path, truth: Path | str | None) -> argparse.Namespace:
         """Return the options with which `replay` runs a bag."""
@@ -99,10 +98,3 @@ def read_settings(out: Path, id: str) -> Settings:
                           f'code {code_digest()}) than the caller ({settings.version}, code '
                           f'{settings.code})')
     return settings
-
-
-def write_aside(path: Path, text: str) -> None:
-    """Write a file so that nobody ever sees a part of it."""
-    aside = path.with_name(f'.{path.name}.part')
-    aside.write_text(text, encoding='utf-8')
-    aside.replace(path)

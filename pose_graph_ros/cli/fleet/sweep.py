@@ -9,6 +9,7 @@ drives that all of them have: an error differs more between drives than between 
 
 from collections.abc import Iterator, Mapping, Sequence
 import csv
+import io
 import itertools
 import math
 from pathlib import Path
@@ -17,14 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.parameters import yaml_text_of, yaml_value
-from pose_graph_ros.cli.fleet.settings import write_aside
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.io.atomic_files import write_files
 
 SCORES = {'held-out': 'held_out_rms_m', 'truth': 'truth_rms_m'}
 """Columns of the table by the name of a score."""
 TABLE, BEST = 'sweep.csv', 'best.yaml'
 DIGITS = 4  # of a random value
 MOST_POINTS = 100_000
+IN_METRES = ('mean', 'spread', 'worst', 'worse_by', 'standard_error')
 
 Point = Mapping[str, Any]
 """Values by parameter."""
@@ -128,19 +130,16 @@ def lines(found: Sequence[Scored]) -> Iterator[str]:
 def write(found: Sequence[Scored], given: Mapping[str, Any], score: str, out: Path) -> None:
     """Write the table of the points, and the best one as a parameter file."""
     names = [*found[0].parameters]
-    aside = out / f'.{TABLE}.part'
-    with aside.open('w', encoding='utf-8', newline='') as file:
-        writer = csv.writer(file)
-        writer.writerow([*names, *(f'{name}_m' if name in (
-            'mean', 'spread', 'worst', 'worse_by', 'standard_error') else name
-            for name in Scored._fields[1:])])
-        writer.writerows([*(yaml_text_of(each.parameters[name]) for name in names), *each[1:]]
-                         for each in found)
-    aside.replace(out / TABLE)
+    text = io.StringIO(newline='')
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow([*names, *(f'{name}_m' if name in IN_METRES else name
+                               for name in Scored._fields[1:])])
+    writer.writerows([*(yaml_text_of(each.parameters[name]) for name in names), *each[1:]]
+                     for each in found)
     best = found[0]
-    write_aside(out / BEST, '\n'.join([
+    write_files({out / TABLE: text.getvalue().encode(), out / BEST: '\n'.join([
         f'# Made by pose-graph fleet --sweep: the best of {len(found)} points by the error '
         f'({score}) of {best.drives} drives:',
         f'# {best.mean:.4g} m in the mean, spread {best.spread:.3g} m, worst {best.worst:.4g} m.',
         '/**:', '  ros__parameters:', *(f'    {name}: {yaml_text_of(value)}' for name, value in {
-            **given, **best.parameters}.items())]) + '\n')
+            **given, **best.parameters}.items()), '']).encode()})

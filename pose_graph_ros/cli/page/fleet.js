@@ -99,9 +99,9 @@ function showPoints() {
   const names = [...new Set(DATA.points.flatMap(({parameters}) => Object.keys(parameters)))];
   const host = section('points', 'Settings, best first');
   host.append(table('errors card', [...names, 'drives', 'failed', 'mean', 'spread', 'worst',
-    'better by', 'standard error'], DATA.points.map((point) => [
+    'worse than the best by', 'standard error'], DATA.points.map((point) => [
     ...names.map((name) => String(point.parameters[name] ?? '–')), whole(point.drives),
-    whole(point.failed), ...[point.mean, point.spread, point.worst, point.better_by,
+    whole(point.failed), ...[point.mean, point.spread, point.worst, point.worse_by,
       point.standard_error].map((value) => number(value))])));
   host.querySelector('table').prepend(make('caption', {}, DATA.subtitle));
 }

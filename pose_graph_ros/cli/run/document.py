@@ -18,6 +18,7 @@ import numpy as np
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import drive as drives, finite
 from pose_graph_ros.cli.drive import BELIEVED, distances, Drive, extent, HELD_OUT, REFUSED
+from pose_graph_ros.cli.html_page import duration_text, length_text
 from pose_graph_ros.cli.run import Frame, number, rounded, Run, thinned
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
@@ -30,7 +31,6 @@ from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.core.quantities import Metres, Seconds
 from pose_graph_ros.offline import pattern as patterns
 from pose_graph_ros.offline.source_residuals import spread
 
@@ -155,18 +155,6 @@ def _facts(run: Run) -> list[dict[str, str]]:
     if longest is not None:
         facts.append(('longest update', f'{longest:.1f} ms', f'of {run.recorder.n_updates}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
-
-
-def duration_text(duration: Seconds) -> str:
-    """Return a duration for people."""
-    minutes, seconds = divmod(round(duration), 60)
-    return f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
-        minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
-
-
-def length_text(length: Metres) -> str:
-    """Return a length for people."""
-    return f'{length:.1f} m' if length < 1000.0 else f'{1e-3 * length:.2f} km'
 
 
 def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]:
