@@ -19,12 +19,12 @@ import threading
 from types import FrameType
 
 from pose_graph_ros import __version__
-from pose_graph_ros.cli import arguments, simulation_options
+from pose_graph_ros.cli import arguments, fleet_options, simulation_options
 from pose_graph_ros.core.exceptions import PoseGraphError
 
 TOOLS = {declare.__name__.replace('_', '-'): declare for declare in (
     arguments.demo, arguments.replay, arguments.solve, arguments.report, arguments.draw,
-    arguments.marginalize, arguments.tune, arguments.fleet, arguments.migrate,
+    arguments.marginalize, arguments.tune, fleet_options.fleet, arguments.migrate,
     simulation_options.simulate,
     arguments.parameters, arguments.compile_kernels)}
 """Tools and what adds their arguments, whose docstrings say what they do."""

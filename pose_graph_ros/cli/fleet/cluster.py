@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do tasks on a Dask cluster: one that is given, or workers on this machine."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 import itertools
 import logging
@@ -66,17 +66,17 @@ def connected(scheduler: str | None, workers: int | None) -> Iterator[Client]:
             yield client
 
 
-def results(client: Client, tasks: Iterable[Task]) -> Iterator[tuple[Task, dict[str, Any]]]:
+def results(client: Client, tasks: Collection[Task]) -> Iterator[tuple[Task, dict[str, Any]]]:
     """
     Yield tasks with what they return, in the order in which they are done.
 
     Of a task whose workers died again and again, it is a failed row. Raises `ClusterError` if the
     scheduler is lost.
     """
-    rest = iter(tasks)
-    first = [*itertools.islice(rest, MOST_WAITING)]
-    if len(first) == 0:
-        return
+    # Dask keeps what is more than twice the threads until a worker is free; fewer it hands out at
+    # once, where they count as suspects if a worker that has several of them dies
+    threads, rest = sum(client.nthreads().values()), iter(tasks)
+    at_once = MOST_WAITING if len(tasks) > 2 * threads else threads
     numbers = itertools.count()
 
     def submit(some: list[Task]) -> list[Future]:
@@ -87,7 +87,7 @@ def results(client: Client, tasks: Iterable[Task]) -> Iterator[tuple[Task, dict[
         return futures
 
     known: dict[Any, Task] = {}
-    waiting = as_completed(submit(first), loop=client.loop)
+    waiting = as_completed(submit([*itertools.islice(rest, at_once)]), loop=client.loop)
     for future in waiting:
         task = known.pop(future.key)
         yield task, _row(future)
