@@ -275,9 +275,9 @@ def street_path(
 
 
 def grid(n: int = 3500, seed: int = SEED) -> World:
-    """Return a walk like M3500, 3500 nodes."""
+    """Return a walk like M3500, 3500 nodes; the area grows with more."""
     rng = np.random.default_rng(seed)
-    truth = street_path(rng, n, 1.0, np.full(12, 4.0), fresh=1.0)
+    truth = street_path(rng, n, 1.0, np.full(_streets(12, n / 3500), 4.0), fresh=1.0)
     pairs = _pairs(truth, rng, round(0.558 * n), radius=1.5, gap=4, per_node=5)
     return arranged('grid', truth, joined(truth, pairs, (0.023,) * 3, rng, pessimism=6.5))
 
@@ -313,9 +313,10 @@ def campus(n: int = 808, seed: int = SEED) -> World:
 
 
 def drive(n: int = 4541, seed: int = SEED) -> World:
-    """Return a drive like kitti_00, 4541 nodes, 137 closures."""
+    """Return a drive like kitti_00, 4541 nodes, 137 closures; the area grows with more."""
     rng = np.random.default_rng(seed)
-    truth = street_path(rng, n, 0.82, rng.uniform(60.0, 160.0, 4), fresh=1.0, rounding=15)
+    spacing = rng.uniform(60.0, 160.0, _streets(4, n / 4541))
+    truth = street_path(rng, n, 0.82, spacing, fresh=1.0, rounding=15)
     i, j = _bursts(truth, rng, round(0.0302 * n), radius=4.0, gap=200, length=(6, 30), every=3)
     sigma, pessimism = (0.02, 0.022, 0.001), 2.0
     # as the set has it: the heading correlated with both coordinates
@@ -323,6 +324,11 @@ def drive(n: int = 4541, seed: int = SEED) -> World:
     weight = np.linalg.inv(correlation * np.outer(sigma, sigma) * pessimism**2)
     edges = joined(truth, (j, i), sigma, rng, weight=weight)
     return arranged('drive', truth, edges)
+
+
+def _streets(least: int, longer: float) -> int:
+    """Return the number of streets with which each is driven as often on a longer way."""
+    return max(least, round(least * float(np.sqrt(longer))))
 
 
 def _candidates(truth: FloatArray, radius: float, gap: int) -> IntArray:
@@ -365,9 +371,6 @@ def _bursts(
             size = every * int(rng.integers(*length))
             runs.append(pairs[at:min(at + size, end):every])
             at += size
-    chosen: list[IntArray] = []
-    for k in rng.permutation(len(runs)):
-        chosen.append(runs[k][:count - sum(map(len, chosen))])
-    found = np.concatenate(chosen)
+    found = np.concatenate([runs[k] for k in rng.permutation(len(runs))])[:count]
     found = found[np.argsort(found[:, 1])]
     return found[:, 0], found[:, 1]

@@ -30,7 +30,7 @@ PARTS = {
     'Tools': ['docs/tools/*'],
     'Reference': ['docs/topics', 'docs/services', 'docs/parameters', 'docs/bad_data',
                   'docs/conventions', 'docs/docker'],
-    'Inside': ['docs/design', 'docs/solver', 'docs/reliability', 'docs/security',
+    'Inside': ['docs/design', 'docs/solver', 'docs/scale', 'docs/reliability', 'docs/security',
                'CONTRIBUTING'],
     'Measured': ['docs/benchmarks/README', 'docs/benchmarks/*/README',
                  'Under load with 1000 nodes <docs/benchmarks/load/1000_nodes/README>']}

@@ -22,3 +22,13 @@ def test_the_benchmark_loads_and_makes_its_drives(monkeypatch: pytest.MonkeyPatc
     drive = sys.modules['benchmark.inputs'].CART.drive(0)
     assert len(drive.fixes) > 10
     assert np.all(np.isfinite(drive.fixes))
+
+
+def test_a_graph_in_parts_has_the_optimum_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT)
+    partition, worlds = (importlib.import_module(f'benchmark.{name}') for name in (
+        'partition', 'worlds'))
+    *_, last = partition.in_parts(worlds.drive(2000), 4)
+    assert last['parts'] > 2
+    assert last['off'] < partition.SAME
+    assert abs(last['above']) < 1e-8
