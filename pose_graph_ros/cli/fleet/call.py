@@ -27,6 +27,7 @@ from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.io.atomic_files import write_files
 
 CONTENTS = 'contents.json'  # digests of bags by path, with the stamps for which they hold
+LOG = 'workers.log'
 HELD_OUT = 5  # of so many fixes one, if a sweep is to score them and nothing is said
 Row = dict[str, Any]
 
@@ -164,7 +165,9 @@ def _do(results: Results, options: argparse.Namespace) -> None:
     unfinished = results.out / UNFINISHED
     shutil.rmtree(unfinished, ignore_errors=True)   # of calls that were killed
     try:
-        with cluster.connected(options.scheduler, options.workers) as client:
+        log = results.out / LOG
+        log.unlink(missing_ok=True)
+        with cluster.connected(options.scheduler, options.workers, log) as client:
             print(f'dashboard: {client.dashboard_link}', flush=True)
             print(f'{len(todo)} drives to replay, {len(results.found)} kept', flush=True)
             if options.scheduler is not None and len(client.scheduler_info()['workers']) == 0:

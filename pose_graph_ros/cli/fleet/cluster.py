@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import itertools
 import logging
 from multiprocessing import resource_tracker
+from pathlib import Path
 import signal
 from typing import Any
 
@@ -22,6 +23,8 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 MOST_WAITING = 10_000  # tasks that the scheduler knows of at a time
 TRIES = 4  # of a task whose workers die, by Dask's allowed-failures: once, and three times again
 LOCAL = '127.0.0.1'
+TO_LOG = 'import os\nos.dup2(os.open({!r}, os.O_WRONLY | os.O_APPEND | os.O_CREAT), 2)\n'
+"""What a worker runs first."""
 PATIENCE = 20.0  # until a scheduler answers [s]
 
 
@@ -30,15 +33,18 @@ class ClusterError(PoseGraphError):
 
 
 @contextmanager
-def connected(scheduler: str | None, workers: int | None) -> Iterator[Client]:
+def connected(scheduler: str | None, workers: int | None, log: Path) -> Iterator[Client]:
     """
     Yield a client of the scheduler at an address, or of new workers on this machine.
 
-    These are processes with one thread each, by default as many as there are processors.
+    These are processes with one thread each, by default as many as there are processors. What they
+    say goes to the log.
     """
     # a worker gets one task at a time: if it dies, no other counts as one that kills workers
     settings = {'distributed.scheduler.worker-saturation': 1.0,
-                'distributed.scheduler.allowed-failures': TRIES - 1}
+                'distributed.scheduler.allowed-failures': TRIES - 1,
+                # on a busy machine a worker takes long to start again
+                'distributed.deploy.lost-worker-timeout': '1h'}
     # what dies is told below, by bag
     for handler in logging.getLogger('distributed').handlers:
         handler.setLevel(logging.CRITICAL)
@@ -59,7 +65,8 @@ def connected(scheduler: str | None, workers: int | None) -> Iterator[Client]:
         try:
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host=LOCAL,
-                dashboard_address=f'{LOCAL}:0', silence_logs=logging.CRITICAL)
+                dashboard_address=f'{LOCAL}:0', silence_logs=logging.CRITICAL,
+                preload=[TO_LOG.format(str(log.absolute()))])
         finally:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         with cluster, Client(cluster, set_as_default=False) as client:
