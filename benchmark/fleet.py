@@ -35,7 +35,7 @@ from pose_graph_ros.cli.main import main as tool
 from pose_graph_ros.cli.replay import replayed
 from pose_graph_ros.cli.run import document
 
-COUNTS = (10_000, 20_000, 40_000)
+COUNTS = (0, 10_000, 20_000, 40_000)
 """Tasks that a scheduler holds, and rows that a call holds."""
 USUAL = {**dict.fromkeys(OF_BAGS), 'hold_out': 0}
 
@@ -73,23 +73,24 @@ def fleet(bags: Path, out: Path, workers: int) -> dict[str, float]:
 
 
 def scheduler_memory(folder: Path) -> list[float]:
-    """Return the bytes that a scheduler without workers holds of each task, by `COUNTS`."""
+    """Return the megabytes that a scheduler without workers has, by `COUNTS` of its tasks."""
     process = subprocess.Popen(
         [sys.executable, '-c', 'import asyncio, distributed\n'
          'async def run():\n'
          "    async with distributed.Scheduler(host='127.0.0.1', port=0) as one:\n"
          '        print(one.address, flush=True)\n        await one.finished()\n'
-         'asyncio.run(run())'], stdout=subprocess.PIPE, text=True)
+         'asyncio.run(run())'], stdout=subprocess.PIPE, text=True,
+        stderr=subprocess.DEVNULL)
     assert process.stdout is not None
     found = []
     try:
         with Client(process.stdout.readline().strip(), set_as_default=False) as client:
-            before, held = psutil.Process(process.pid).memory_info().rss, list[Any]()
+            held = list[Any]()
             for count in COUNTS:
                 held += client.map(do, [_task(folder, k) for k in range(len(held), count)])
                 while client.run_on_scheduler(_tasks) < count:
                     time.sleep(0.1)
-                found.append((psutil.Process(process.pid).memory_info().rss - before) / count)
+                found.append(1e-6 * psutil.Process(process.pid).memory_info().rss)
     finally:
         process.kill()
         process.wait()
@@ -107,17 +108,16 @@ def _task(folder: Path, k: int) -> Task:
 
 
 def call_memory(folder: Path) -> list[float]:
-    """Return the bytes that a call holds of each drive, with the table made of them."""
+    """Return the megabytes of a call that holds rows, by `COUNTS`, with the table made of them."""
     settings, found = Settings({}, USUAL), []
     for count in COUNTS:
-        before = resident_bytes()
         held = Results(folder, [_task(folder, k).recording for k in range(count)],
                        [({}, settings)])
         for k, each in enumerate(held.recordings):
             held.add(0, each, table.failed_row('a reason ' * 5) | {
                 column.name: float(k) for column in table.COLUMNS if column.type == 'double'})
         table.write_table(held.rows, folder)
-        found.append((resident_bytes() - before) / count)
+        found.append(1e-6 * resident_bytes())
     return found
 
 
@@ -129,8 +129,9 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        print('scheduler, bytes a task:', *(f'{each:.0f}' for each in scheduler_memory(folder)))
-        print('call, bytes a drive:', *(f'{each:.0f}' for each in call_memory(folder)))
+        print('tasks or drives:', *COUNTS)
+        print('scheduler [MB]:', *(f'{each:.0f}' for each in scheduler_memory(folder)))
+        print('call [MB]:', *(f'{each:.0f}' for each in call_memory(folder)))
         write_bags(folder / 'bags', options.bags, options.seconds)
         size = sum(path.stat().st_size for path in (folder / 'bags').rglob('*'))
         print(f'{options.bags} bags of {options.seconds} s, {1e-6 * size / options.bags:.2f} MB')

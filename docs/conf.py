@@ -29,7 +29,7 @@ PARTS = {
     'Guides': ['docs/guides/*'],
     'Tools': ['docs/tools/*'],
     'Reference': ['docs/topics', 'docs/services', 'docs/parameters', 'docs/bad_data',
-                  'docs/conventions', 'docs/docker'],
+                  'docs/conventions', 'docs/fleet', 'docs/docker'],
     'Inside': ['docs/design', 'docs/solver', 'docs/scale', 'docs/reliability', 'docs/security',
                'CONTRIBUTING'],
     'Measured': ['docs/benchmarks/README', 'docs/benchmarks/*/README',

@@ -37,7 +37,7 @@ LEFT_OUT = shutil.ignore_patterns(
 DEADLINE = 240.0    # [s] of any one command, below the time limit of a test
 
 ASK = f"""
-from importlib.metadata import distribution
+from importlib.metadata import distribution, requires
 import json
 from ament_index_python import get_package_prefix, get_package_share_directory
 import {PACKAGE}
@@ -47,7 +47,7 @@ print(json.dumps({{
     'prefix': get_package_prefix('{PACKAGE}'), 'module': {PACKAGE}.__file__,
     'share': get_package_share_directory('{PACKAGE}'), 'version': {PACKAGE}.__version__,
     'commands': sorted(point.name for point in points if callable(point.load())),
-    'page': render({{}})}}))
+    'page': render({{}}), 'requires': requires('{PACKAGE}')}}))
 """
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -211,6 +211,13 @@ def test_what_tools_read_is_installed_with_them(installation):
     assert installation.answers['page'].rstrip().endswith('</html>')
     where = Path(installation.answers['module']).parent
     assert all((where / 'cli' / path).is_file() for path in expected)
+
+
+def test_dask_comes_with_its_extra_alone(installation):
+    asked = [text for text in installation.answers['requires']
+             if text.startswith(('dask', 'distributed', 'pyarrow', 'bokeh', 'fsspec'))]
+    assert len(asked) == 3
+    assert all(text.endswith('extra == "fleet"') for text in asked)
 
 
 def test_version_is_the_same_everywhere():

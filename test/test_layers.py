@@ -66,6 +66,7 @@ TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',
        'core.transaction', 'core.warm_up'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}
+DASK = {'dask', 'distributed', 'fsspec', 'pyarrow'}  # the extra `fleet`
 ROS = {'rclpy', 'rosidl_runtime_py', 'ament_index_python', 'launch', 'launch_ros'}
 
 # What the node decides without ROS, so that it can be tested without.
@@ -185,6 +186,24 @@ def test_adapters_node_and_tools_import_nothing_above_them() -> None:
                 if (found := own_imports(path) & names)]
 
 
+def test_only_the_fleet_imports_dask() -> None:
+    assert {path.parts[:2] for path in MODULES if libraries(path) & DASK} == {('cli', 'fleet')}
+    # and the module that is imported first looks for them before
+    assert not libraries(Path('cli', 'fleet', '__init__.py')) & DASK
+
+
+def test_without_dask_one_line_says_what_to_install() -> None:
+    code = (f'import sys; sys.modules |= dict.fromkeys({sorted(DASK)!r})\n'
+            'from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))')
+    for words, expected in ((['fleet', 'bags'], 2), (['parameters'], 0), (['fleet', '-h'], 0)):
+        done = subprocess.run([sys.executable, '-c', code, *words], check=False, text=True,
+                              capture_output=True, timeout=240)
+        assert done.returncode == expected, done.stderr
+        assert done.stderr == ('' if expected == 0 else (
+            'error: pose-graph fleet needs dask, distributed, fsspec, pyarrow: pip install '
+            "'dask[distributed]' pyarrow bokeh\n"))
+
+
 def test_examples_can_be_copied_out_of_the_package() -> None:
     assert not [(path, found) for path in modules('examples') if (found := own_imports(path))]
 
@@ -197,7 +216,7 @@ def test_a_fresh_interpreter_has_no_rclpy_after_an_import() -> None:
         [sys.executable, '-c', code], check=True, capture_output=True, text=True, timeout=240)
     core, loaded = (line.split() for line in done.stdout.splitlines())
     assert {'pose_graph_ros.core.backend', *tools} <= set(loaded)
-    assert not {name for name in loaded if is_ros(name)}
+    assert not {name for name in loaded if is_ros(name) or name in DASK}
     # (Numba reads a settings file, with PyYAML if that is there)
     assert not {name for name in core if name.startswith(('rosbags', 'matplotlib'))}
 

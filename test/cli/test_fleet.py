@@ -22,7 +22,7 @@ import pytest
 from pose_graph_ros.cli.fleet import table
 
 KILLS = 5
-DEADLINE = 70.0  # of a call [s]
+DEADLINE = 200.0  # of a call [s]
 GIVEN = '--truth', '/ground_truth', '--hold-out', '5'
 TIMES = ('total_s', 'peak_memory_mb', 'run_s')  # columns that differ from run to run
 
@@ -181,8 +181,7 @@ def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
     # as if it needed more memory than there is
     out, file = tmp_path / 'out', tmp_path / 'deadly.py'
     file.write_text(
-        'import os, signal, sys, faulthandler\n'
-        "if __name__ == '__main__': faulthandler.dump_traceback_later(50)\n"
+        'import os, signal, sys\n'
         'from pose_graph_ros.cli.fleet import cluster\n'
         'from pose_graph_ros.cli.main import main\n'
         'do = cluster.do\n'
@@ -197,8 +196,8 @@ def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
                           capture_output=True, text=True, check=False, timeout=DEADLINE)
     assert done.returncode == 1, done.stderr
     assert '3 drives: 2 replayed, 0 kept, 1 failed' in done.stdout
-    assert done.stderr == (f'failed: {bags}/day01: its worker died 4 times; perhaps it had too '
-                           'little memory\n')
+    assert done.stderr == (f'failed: {bags}/day01: its worker died 4 times; if it had too little '
+                           'memory, fewer workers have more each\n')
     # on a machine that has more, it is done
     assert fleet(bags, '-o', out).counts == '3 drives: 1 replayed, 2 kept, 0 failed'
 

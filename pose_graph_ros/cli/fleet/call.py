@@ -4,7 +4,7 @@
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 import fcntl
 import json
@@ -16,12 +16,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.fleet import overview, sweep, table
 from pose_graph_ros.cli.fleet.kept import key_of, read_map, read_result, UNFINISHED
 from pose_graph_ros.cli.fleet.recordings import find_recordings, Recording, stamp_of
-from pose_graph_ros.cli.fleet.settings import OF_BAGS, Settings
+from pose_graph_ros.cli.fleet.settings import BESIDE, OF_BAGS, Settings
 from pose_graph_ros.cli.fleet.sweep import Point, SCORES
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.io.atomic_files import write_files
@@ -58,6 +57,8 @@ def _points(options: argparse.Namespace) -> tuple[list[tuple[Point, Settings]], 
     """Return the points of the sweep with their settings, or one point; and how many are wrong."""
     given = shared.given_parameters(options)
     is_sweep = len(options.sweep) > 0
+    if isinstance(options.truth, Path) and not str(options.truth).startswith(BESIDE):
+        options.truth = options.truth.absolute()
     if is_sweep and options.score == 'truth' and options.truth is None:
         raise ConfigError('--score truth: expected --truth, which says where it is')
     if is_sweep and options.score == 'held-out' and options.hold_out == 0:
@@ -65,19 +66,19 @@ def _points(options: argparse.Namespace) -> tuple[list[tuple[Point, Settings]], 
     if not is_sweep and options.trials is not None:
         raise ConfigError('--trials: expected --sweep, which says between what')
     wanted = sweep.points_of(options.sweep, options.trials, options.seed) if is_sweep else [{}]
-    points, errors = list[tuple[Point, Settings]](), list[ConfigError]()
+    points, errors = dict[str, tuple[Point, Settings]](), list[ConfigError]()
     for point in wanted:
         try:
-            checked({**given, **point})
-            points.append((point, Settings({**given, **point}, {
-                name: getattr(options, name) for name in OF_BAGS})))
+            settings = Settings({**given, **point}, {
+                name: getattr(options, name) for name in OF_BAGS})
+            points.setdefault(settings.id, (point, settings))
         except ConfigError as error:
             errors.append(error)
     if len(points) == 0:
         raise errors[0]
     for text in dict.fromkeys(map(str, errors)):
         print(f'left out: {text}', file=sys.stderr)
-    return points, len(errors)
+    return [*points.values()], len(errors)
 
 
 @dataclass
@@ -91,10 +92,10 @@ class Results:
     contents: dict[str, list[str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        try:
-            self.contents = json.loads((self.out / CONTENTS).read_text(encoding='utf-8'))
-        except (OSError, ValueError):
-            self.contents = {}  # then all bags are read again
+        with suppress(OSError, ValueError, AttributeError):     # else all bags are read again
+            self.contents = {path: each for path, each in json.loads(
+                (self.out / CONTENTS).read_text(encoding='utf-8')).items()
+                if isinstance(each, list) and len(each) == 2}
         for k, (_, settings) in enumerate(self.points):
             for each in self.recordings:
                 stamp, content = self.contents.get(each.path, ['', ''])
@@ -192,8 +193,12 @@ def _write(results: Results, options: argparse.Namespace) -> None:
         best = next(k for k, (point, _) in enumerate(results.points)
                     if point is found[0].parameters)
         print('\n'.join(sweep.lines(found)))
-        sweep.write(found, shared.given_parameters(options), options.score, out)
-        written += [sweep.TABLE, sweep.BEST]
+        if found[0].drives > 0:
+            sweep.write(found, shared.given_parameters(options), options.score, out)
+            written += [sweep.TABLE, sweep.BEST]
+        else:
+            print(f'no drive has a score ({options.score}), so no point is the best',
+                  file=sys.stderr)
     page = overview.write_overview(
         results.of_point(best), out, lambda row: read_map(out, row['folder']),
         title=out.absolute().name, subtitle=_subtitle(options),

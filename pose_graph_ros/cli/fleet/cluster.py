@@ -108,7 +108,8 @@ def _row(future: Future) -> dict[str, Any]:
         row: dict[str, Any] = future.result()
         return row
     except KilledWorker:
-        return table.failed_row(f'its worker died {TRIES} times; perhaps it had too little memory')
+        return table.failed_row(f'its worker died {TRIES} times; if it had too little memory, '
+                                'fewer workers have more each')
     except Exception as error:  # of a worker that cannot even read the task
         if isinstance(error, OSError) or future.status != 'error':
             raise ClusterError('the scheduler is lost') from error

@@ -6,7 +6,7 @@ Find bags, tell whether they have changed, and bring them to where they are repl
 A bag is named by a path, or by a URL of a file system that fsspec knows.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import glob
 import hashlib
@@ -38,7 +38,7 @@ class Recording(NamedTuple):
 
     name: str  # for people
     path: str  # or URL
-    files: Sequence[str] = ()  # URLs of its files, if it has to be fetched
+    files: tuple[str, ...] = ()  # URLs of its files, if it has to be fetched
     stamp: str = ''  # another one if the bag may have changed; empty if that is not known
 
     @property
@@ -73,7 +73,7 @@ def _meant(word: str, out: Path) -> Iterator[Recording]:
     elif path.suffix in LISTS and path.is_file():
         for line in map(str.strip, path.read_text(encoding='utf-8').splitlines()):
             if line != '' and not line.startswith('#'):
-                yield from [*_meant(line, out)] or [Recording(path.stem, line)]
+                yield from [*_meant(line, out)] or [_local(line)]
     elif path.is_dir():
         names = (os.path.join(folder, name) for folder, _, names in os.walk(
             path, followlinks=True) if not Path(folder).absolute().is_relative_to(out)
@@ -88,8 +88,9 @@ def _meant(word: str, out: Path) -> Iterator[Recording]:
 
 
 def _local(path: str) -> Recording:
-    files = files_of(Path(path))
-    return Recording(Path(path).stem, path, stamp=stamp_of(files))
+    # workers may be elsewhere
+    absolute = Path(os.path.abspath(path))
+    return Recording(absolute.stem, str(absolute), stamp=stamp_of(files_of(absolute)))
 
 
 def stamp_of(files: Iterable[Path]) -> str:
@@ -148,7 +149,7 @@ def _remote(url: str) -> Iterator[Recording]:
                 is_known = all(len(each) > 1 for each in facts.values())    # not the size alone
                 yield Recording(
                     PurePosixPath(bag).stem, system.unstrip_protocol(bag) + chain + rest,
-                    [system.unstrip_protocol(each) + chain + rest for each in own],
+                    tuple(system.unstrip_protocol(each) + chain + rest for each in own),
                     _digest(facts) if is_known else '')
     except Exception as error:  # of file systems of others, which raise anything
         raise BagError(f'{url}: {one_line(error)}') from error

@@ -28,7 +28,7 @@ from pose_graph_ros.core.io.atomic_files import write_files
 FOLDER = 'settings'
 OF_BAGS = ('begin', 'until', 'edge2', 'hold_out', 'stretch', 'align', 'truth', *OPTIONS)
 """Options of `pose-graph replay` that are the same for all bags."""
-BESIDE = '{}'  # in the path of a truth: the path of the bag without its suffix
+BESIDE = '{}'  # at the begin of the path of a truth: the path of the bag without its suffix
 
 
 @functools.cache
