@@ -269,6 +269,9 @@ def as_bytes(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return table.view(np.dtype((np.void, table.itemsize)))
 
 
+MOST = {'pool_f': 2**31 - 1}  # rows; cliques have indices of 32 bits into these
+
+
 class Memory:
     """Owns the tables and the head of one graph, which is interrupted with that of another."""
 
@@ -309,13 +312,23 @@ class Memory:
         self.head[:], self._tables = other.head, other._tables  # noqa: SLF001
 
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
-        """Make a table grow to at least a given number of rows."""
+        """Make a table grow to at least a given number of rows, else raise LinearSolveError."""
         at = 2 * NAMES.index(name)
-        if name in self._tables and rows <= self.head[at + 1]:
+        have = int(self.head[at + 1]) if name in self._tables else 0
+        if name in self._tables and rows <= have:
             return
-        # unused pages cost address space only, so tables grow fast and are rarely copied
-        capacity = max(rows, 4 * int(self.head[at + 1]))
-        grown = _pages(capacity, TABLES[name])
+        most = MOST.get(name, np.iinfo(np.int64).max)
+        if rows > most:
+            raise LinearSolveError(f'{name}: expected at most {most} rows, got {rows}')
+        # unused pages cost address space only, so tables grow fast and are rarely copied; but no
+        # system gives more at once than it has
+        for wanted in (4 * have, have + have // 4, rows):
+            capacity = min(max(rows, wanted), most)
+            with contextlib.suppress(OSError, MemoryError, OverflowError):
+                grown = _pages(capacity, TABLES[name])
+                break
+        else:
+            raise LinearSolveError(f'{name}: no memory for {rows} rows')
         if keep > 0:
             as_bytes(grown)[:keep] = as_bytes(self._tables[name])[:keep]
         self._tables[name] = grown

@@ -57,3 +57,25 @@ print(reserved, resident(*memory) - before)
 ''')
     assert reserved < 2.0       # of 1 GB of addresses
     assert filled < 25.0        # 1 kB for each node with its edge and its clique
+
+
+def test_a_table_grows_by_less_where_the_system_has_no_more() -> None:
+    less, told, most = run('''
+import resource
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.graph.tables import Memory
+memory, rows = Memory(), 50_000_000
+memory.ensure('pool_f', rows)
+memory['pool_f'][:3] = 1.0, 2.0, 3.0
+size = int(next(line for line in open('/proc/self/status') if 'VmSize' in line).split()[1]) * 1024
+resource.setrlimit(resource.RLIMIT_AS, (size + 3 * 8 * rows, resource.RLIM_INFINITY))
+memory.ensure('pool_f', rows + 1, keep=3)   # not four times as many
+less = rows < len(memory['pool_f']) < 2 * rows and memory['pool_f'][:3].tolist() == [1.0, 2.0, 3.0]
+def told(rows):
+    try:
+        memory.ensure('pool_f', rows, keep=3)
+    except LinearSolveError as error:
+        return str(rows) in str(error) and memory['pool_f'][2] == 3.0
+print(int(less), int(told(10 * rows)), int(told(2**31)))
+''')
+    assert (less, told, most) == (1, 1, 1)
