@@ -164,8 +164,8 @@ def test_what_cannot_be_read_is_told_in_a_line_each(
     assert (done.code, done.counts) == (1, '4 drives: 2 replayed, 0 kept, 2 failed')
     lines = sorted(done.errors.splitlines())
     assert len(lines) == 2
-    assert lines[0].startswith(f'failed: {folder}/day01: {folder}/day01: damaged')
-    assert lines[1] == f'failed: {folder}/none.mcap: {folder}/none.mcap: does not exist'
+    assert lines[0].startswith(f'failed: {folder}/day01: damaged')
+    assert lines[1] == f'failed: {folder}/none.mcap: does not exist'
     rows = rows_in(out)
     assert [rows[name]['status'] for name in ('day00', 'day01', 'none')] == [
         'converged', 'failed', 'failed']

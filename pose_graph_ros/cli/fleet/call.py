@@ -22,6 +22,7 @@ from pose_graph_ros.cli.fleet.kept import key_of, read_map, read_result, UNFINIS
 from pose_graph_ros.cli.fleet.recordings import find_recordings, Recording, stamp_of
 from pose_graph_ros.cli.fleet.settings import BESIDE, OF_BAGS, Settings
 from pose_graph_ros.cli.fleet.sweep import Point, SCORES
+from pose_graph_ros.cli.fleet.task import Task
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
 from pose_graph_ros.core.io.atomic_files import write_files
 
@@ -149,18 +150,12 @@ def _do(results: Results, options: argparse.Namespace) -> None:
     todo = results.missing
     if len(todo) == 0:
         return
-    # Dask and the engine take seconds to load
-    from pose_graph_ros.cli.fleet import cluster  # noqa: PLC0415
-    from pose_graph_ros.core.compiled import jit  # noqa: PLC0415
-    from pose_graph_ros.core.warm_up import warm_up  # noqa: PLC0415
+    from pose_graph_ros.cli.fleet import cluster  # noqa: PLC0415  (Dask takes time to load)
 
-    if options.scheduler is None and not jit.is_cached():
-        print('compiling the solver, once', file=sys.stderr)
-        warm_up()
     for _, settings in results.points:
         settings.write(results.out)
     name = secrets.token_hex(4)
-    asked: dict[cluster.Task, tuple[int, Recording]] = {cluster.Task(
+    asked: dict[Task, tuple[int, Recording]] = {Task(
         str(results.out.absolute()), name, results.points[k][1].id, each): (k, each)
         for k, each in todo}
     unfinished = results.out / UNFINISHED

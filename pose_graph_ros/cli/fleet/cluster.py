@@ -44,7 +44,10 @@ def connected(scheduler: str | None, workers: int | None, log: Path) -> Iterator
     settings = {'distributed.scheduler.worker-saturation': 1.0,
                 'distributed.scheduler.allowed-failures': TRIES - 1,
                 # on a busy machine a worker takes long to start again
-                'distributed.deploy.lost-worker-timeout': '1h'}
+                'distributed.deploy.lost-worker-timeout': '1h',
+                # threads of a worker that look 150 times a second at what the task is doing
+                'distributed.worker.profile.enabled': False,
+                'distributed.admin.tick.interval': '500ms'}
     # what dies is told below, by bag
     for handler in logging.getLogger('distributed').handlers:
         handler.setLevel(logging.CRITICAL)
