@@ -6,8 +6,8 @@ What `pose-graph fleet` costs beside the replays themselves; the figures of docs
     .venv/bin/python -m benchmark.fleet [--bags 200] [--seconds 120]
 
 Simulated drives are replayed with one and with two processes, and one after the other in this
-process, which writes the same files but for the reports. Then a scheduler of its own is given tasks, to see what it
-holds in memory of each; and rows are added as a call holds them.
+process, which writes the same files but for the reports. Then a scheduler of its own is given
+tasks, to see what it holds in memory of each; and rows are added as a call holds them.
 """
 
 import argparse

@@ -5,8 +5,8 @@ Replay many bags on Dask, with one table and one overview, and nothing done twic
 
 Paths of bags come in (`recordings`), with what is done to each (`settings`). Workers of a
 `cluster` do one task for each bag, whose files are `kept` under a key of all that they depend on.
-Rows come back for the `table`, the `overview` and the scores of a `sweep`. Read first `call`, then `worker`.
-Dask, pyarrow and fsspec are imported here alone.
+Rows come back for the `table`, the `overview` and the scores of a `sweep`. Read first `call`, then
+`worker`. Dask, pyarrow and fsspec are imported here alone.
 """
 
 import argparse
