@@ -158,7 +158,7 @@ def _do(results: Results, options: argparse.Namespace) -> None:
     asked: dict[Task, tuple[int, Recording]] = {Task(
         str(results.out.absolute()), name, results.points[k][1].id, each): (k, each)
         for k, each in todo}
-    unfinished = results.out / UNFINISHED
+    told, unfinished = set[str](), results.out / UNFINISHED
     shutil.rmtree(unfinished, ignore_errors=True)   # of calls that were killed
     try:
         log = results.out / LOG
@@ -172,8 +172,10 @@ def _do(results: Results, options: argparse.Namespace) -> None:
                                             total=len(todo), unit='drive'):
                 k, recording = asked[task]
                 results.add(k, recording, row)
-                if row['status'] == table.FAILED:
-                    tqdm.write(f'failed: {recording.path}: {row["reason"]}', file=sys.stderr)
+                line = f'failed: {recording.path}: {row["reason"]}'
+                if row['status'] == table.FAILED and line not in told:  # at another point
+                    told.add(line)
+                    tqdm.write(line, file=sys.stderr)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 
@@ -215,7 +217,8 @@ def _scores(results: Results, options: argparse.Namespace) -> list[sweep.Scored]
 def _subtitle(options: argparse.Namespace) -> str:
     if len(options.sweep) == 0:
         return ''
-    return f'the best point of a sweep, by the error of the path ({options.score})'
+    to = {'held-out': 'fixes that are held out', 'truth': 'the truth'}[options.score]
+    return f'the best point of a sweep, by the rms error of the path to {to} [m]'
 
 
 @contextmanager

@@ -69,9 +69,9 @@ def _known(rows: Sequence[Row], key: str) -> list[float]:
 def _facts(rows: Sequence[Row]) -> Iterator[tuple[str, str, str]]:
     """Yield label, value and note of what stands at the head of the page."""
     new = sum(bool(row['is_new']) for row in rows)
-    yield 'drives', str(len(rows)), '' if new == len(rows) else (
-        f'{new} run now, {len(rows) - new} kept from before')
     failed, stuck = (sum(row['status'] == status for row in rows) for status in STATUSES[:2])
+    kept = len(rows) - new - failed
+    yield 'drives', str(len(rows)), '' if kept == 0 else f'{new} run now, {kept} kept from before'
     yield 'failed', str(failed), f'{stuck} not converged' if stuck > 0 else ''
     yield 'with warnings', str(sum((row['warnings'] or 0) > 0 for row in rows)), ''
     yield 'duration', duration_text(sum(_known(rows, 'duration_s'))), 'of all'
