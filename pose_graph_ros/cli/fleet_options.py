@@ -26,6 +26,7 @@ def fleet(parser: argparse.ArgumentParser) -> None:
       pose-graph fleet bags/ -o sweep --sweep odom.sigma_distance=0.01,0.3 --trials 50
 
     exit code: 0 all converged, 1 some failed or did not converge, 2 wrong input
+    or no scheduler, 130 after Ctrl-C
     """
     parser.add_argument('bags', metavar='BAG', nargs='+',
                         help='bag, folder, pattern, .txt with one in each line, or URL')

@@ -17,6 +17,7 @@ from pose_graph_ros.cli.fleet.recordings import (
     find_recordings,
     local_copy,
     Recording,
+    without_suffix,
 )
 
 
@@ -65,6 +66,64 @@ def test_patterns_and_lists_each_bag_once(tree: Path, monkeypatch: pytest.Monkey
     assert found(tree, 'list.txt') == ['july/one', 'june/x.mcap', 'july/logs', 'nowhere.mcap']
     with pytest.raises(BagError, match='july/logs: no bag, expected rosbag2 folders'):
         found(tree, 'july/logs')
+
+
+def test_a_list_may_name_itself_and_begin_with_a_mark(
+    tree: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tree)
+    monkeypatch.setenv('HOME', str(tree / 'july'))
+    (tree / 'list.txt').write_text('\ufeffjuly/one\r\n~/cut\r\nlist.txt\r\n', newline='')
+    assert found(tree, 'list.txt') == ['july/one', 'july/cut', 'list.txt']
+
+
+def test_a_bag_with_several_names_is_one_whatever_the_links(tree: Path) -> None:
+    for link, target in (('july/alpha', 'one'), ('july/loose/0.mcap', 'a.mcap'),
+                         ('july/again', '.')):
+        (tree / link).symlink_to(target)
+    assert sorted(found(tree, f'{tree}/july', f'{tree}/july/alpha')) == JULY
+    assert found(tree, f'{tree}/july/alpha') == ['july/alpha']
+
+
+def test_results_may_be_where_the_bags_are(tree: Path) -> None:
+    shutil.move(tree / 'out/drives', tree / 'july/drives')
+    words = [f'{tree}/july']
+    assert sorted(os.path.relpath(each.path, tree) for each in find_recordings(
+        words, tree / 'june/../july')) == JULY
+
+
+def test_only_the_suffix_of_a_bag_file_is_taken_from_a_name(tree: Path) -> None:
+    for path, name in (('june/x.mcap', 'x'), ('june/run 1.5', 'run 1.5'),
+                       ('june/run 1.5.db3.zstd', 'run 1.5'), ('june/y.g2o', 'y')):
+        assert find_recordings([f'{tree}/{path}'], tree / 'out')[0].name == name
+        assert without_suffix(f'{tree}/{path}') == f'{tree}/june/{name}'
+
+
+def test_drives_named_by_their_folder_are_not_one_that_was_cut_off(tree: Path) -> None:
+    for day in (1, 2):
+        (tree / f'june/june_{day}.mcap').write_bytes(b'')
+    (tree / 'june/x.mcap').unlink()
+    assert found(tree, f'{tree}/june') == ['june/june_1.mcap', 'june/june_2.mcap']
+
+
+def test_a_name_that_is_no_text_stands_for_a_bag_that_fails(tree: Path) -> None:
+    (tree / 'june' / os.fsdecode(b'bad\xff.mcap')).write_bytes(b'')
+    assert find_recordings([f'{tree}/june'], tree / 'out')[0] == Recording(
+        r'bad\xff', rf'{tree}/june/bad\xff.mcap')
+
+
+def test_a_folder_that_cannot_be_read_is_told(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    def scandir(folder: str) -> object:
+        if str(folder).endswith('loose'):
+            raise PermissionError(13, 'Permission denied', str(folder))
+        return real(folder)
+
+    real = os.scandir
+    monkeypatch.setattr(os, 'scandir', scandir)
+    assert len(found(tree, f'{tree}/july')) == 3
+    assert capsys.readouterr().err == f'left out: {tree}/july/loose: Permission denied\n'
 
 
 def test_a_bag_is_all_that_belongs_to_it(tree: Path) -> None:

@@ -11,16 +11,18 @@ from contextlib import contextmanager
 import glob
 import hashlib
 import os
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 import posixpath
 import re
 import shutil
+import sys
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import fsspec
 
 from pose_graph_ros.adapters.bags import BAG_FILE_SUFFIXES, BagError, JOURNALS, one_line
+from pose_graph_ros.cli.fleet.kept import DRIVES, UNFINISHED
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES
 
 LISTS = ('.txt', '.list')  # suffixes of files with a bag in each line
@@ -51,7 +53,7 @@ def find_recordings(words: Iterable[str], out: Path) -> list[Recording]:
     """
     Return the bags that are meant by paths, patterns, folders, lists and URLs, each once.
 
-    What is in the folder `out` is left out. A path where nothing is stands for a bag that only
+    Results in the folder `out` are left out. A path where nothing is stands for a bag that only
     workers see; so does a line of a list that names no bag, so that the others are replayed.
     Raises `BagError` for a word that names no bag, or a file system that is not installed.
     """
@@ -62,7 +64,8 @@ def find_recordings(words: Iterable[str], out: Path) -> list[Recording]:
             raise BagError(f'{word}: no bag, expected rosbag2 folders or files ending in '
                            f'{", ".join(BAG_FILE_SUFFIXES)}')
         for each in own:
-            found.setdefault(each.path, each)
+            # by a link and by its own name it is one bag
+            found.setdefault(each.path if each.is_remote else os.path.realpath(each.path), each)
     return [*found.values()]
 
 
@@ -71,14 +74,17 @@ def _meant(word: str, out: Path) -> Iterator[Recording]:
     if SCHEME.match(word):
         yield from _remote(word)
     elif path.suffix in LISTS and path.is_file():
-        for line in map(str.strip, path.read_text(encoding='utf-8').splitlines()):
-            if line != '' and not line.startswith('#'):
-                yield from [*_meant(line, out)] or [_local(line)]
+        # as Windows writes it, it may begin with a mark
+        text = path.read_text(encoding='utf-8-sig', errors='surrogateescape')
+        for line in map(str.strip, text.splitlines()):
+            if Path(line).suffix in LISTS:
+                yield _local(line)      # a list may name itself, as that of all files in a folder
+            elif line != '' and not line.startswith('#'):
+                bag = os.path.expanduser(line)
+                yield from [*_meant(bag, out)] or [_local(bag)]
     elif path.is_dir():
-        names = (os.path.join(folder, name) for folder, _, names in os.walk(
-            path, followlinks=True) if not Path(folder).absolute().is_relative_to(out)
-            for name in names)
-        yield from map(_local, _bags_among(names))
+        # links last, so that a bag has its own name
+        yield from map(_local, sorted(_bags_among(_files_below(path, out)), key=os.path.islink))
     elif WILD.search(word) and not path.exists():
         for each in sorted(glob.glob(os.path.expanduser(word), recursive=True)):
             if Path(each).is_dir() or _is_bag_file(each):
@@ -87,10 +93,37 @@ def _meant(word: str, out: Path) -> Iterator[Recording]:
         yield _local(word)
 
 
+def _files_below(root: Path, out: Path) -> Iterator[str]:
+    """Yield files at any depth, each once whatever links there are; none of results."""
+    seen = {os.path.realpath(out / name) for name in (DRIVES, UNFINISHED)}
+    for folder, folders, names in os.walk(root, onerror=_tell_left_out, followlinks=True):
+        if (real := os.path.realpath(folder)) in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders.sort(key=lambda name: os.path.islink(os.path.join(folder, name)))
+        yield from (os.path.join(folder, name) for name in names)
+
+
+def _tell_left_out(error: OSError) -> None:
+    print(f'left out: {error.filename}: {error.strerror}', file=sys.stderr)
+
+
 def _local(path: str) -> Recording:
     # workers may be elsewhere
-    absolute = Path(os.path.abspath(path))
-    return Recording(absolute.stem, str(absolute), stamp=stamp_of(files_of(absolute)))
+    # a name that is no UTF-8 has no place in a table or a message: such a bag is told, and fails
+    absolute = Path(os.fsencode(os.path.abspath(path)).decode('utf-8', 'backslashreplace'))
+    return Recording(_name(str(absolute)), str(absolute), stamp=stamp_of(files_of(absolute)))
+
+
+def without_suffix(path: str) -> str:
+    """Return the path of a bag without its suffix; a folder may have a dot in its name."""
+    stem = path.removesuffix('.zstd')
+    return posixpath.splitext(stem)[0] if _is_bag_file(stem) else path
+
+
+def _name(path: str) -> str:
+    return posixpath.basename(without_suffix(path))
 
 
 def stamp_of(files: Iterable[Path]) -> str:
@@ -126,7 +159,8 @@ def _bags_among(files: Iterable[str]) -> Iterator[str]:
     for folder, names in folders.items():
         # the recorder names its files by the folder, and adds the metadata at its end
         own = re.escape(posixpath.basename(folder.rstrip('/')))
-        is_cut_off = all(re.fullmatch(rf'{own}_\d+\.\w+', name) for name in names)
+        is_cut_off = all(re.fullmatch(rf'{own}_\d+\.[\w.]+', name) for name in names) and any(
+            name.startswith(f'{posixpath.basename(folder)}_0.') for name in names)
         if is_cut_off or (METADATA in names and len(names) > 1):
             yield folder
         else:
@@ -148,7 +182,7 @@ def _remote(url: str) -> Iterator[Recording]:
                          for each, told in own.items()}
                 is_known = all(len(each) > 1 for each in facts.values())    # not the size alone
                 yield Recording(
-                    PurePosixPath(bag).stem, system.unstrip_protocol(bag) + chain + rest,
+                    _name(bag), system.unstrip_protocol(bag) + chain + rest,
                     tuple(system.unstrip_protocol(each) + chain + rest for each in own),
                     _digest(facts) if is_known else '')
     except Exception as error:  # of file systems of others, which raise anything

@@ -22,6 +22,7 @@ from pose_graph_ros.adapters.bags import OPTIONS
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import Exports
+from pose_graph_ros.cli.fleet.recordings import without_suffix
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.io.atomic_files import write_files
 
@@ -72,7 +73,7 @@ class Settings:
         """Return the topic or the file of the truth of a bag, if there is one."""
         truth = self.options['truth']
         if isinstance(truth, Path):
-            return Path(str(truth).replace(BESIDE, str(Path(bag).with_suffix(''))))
+            return Path(str(truth).replace(BESIDE, without_suffix(bag)))
         return truth if truth is None else str(truth)
 
 
