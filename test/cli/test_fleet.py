@@ -156,6 +156,13 @@ def test_half_of_a_result_is_none(fleet: Any, bags: Path, tmp_path: Path) -> Non
     assert fleet(bags, '-o', out).counts == '3 drives: 2 replayed, 1 kept, 0 failed'
     assert (two / 'path.tum').stat().st_size > 0
     assert not (out / 'unfinished').exists()
+    # what another call has cleared away while a worker was still at it
+    told = json.loads((one / 'drive.json').read_text())
+    del told['sizes']['path.tum']
+    (one / 'path.tum').unlink()
+    (one / 'drive.json').write_text(json.dumps(told))
+    assert fleet(bags, '-o', out).counts == '3 drives: 1 replayed, 2 kept, 0 failed'
+    assert (one / 'path.tum').exists()
 
 
 def test_what_cannot_be_read_is_told_in_a_line_each(
@@ -268,6 +275,11 @@ def test_wrong_words_are_told_before_anything_is_done(
             ([tmp_path / 'empty'], f'error: {tmp_path}/empty: no bag'),
             ([f'{tmp_path}/*.mcap'], f'error: {tmp_path}/*.mcap: no bag'),
             (['nothing://bags/*'], 'error: nothing://bags/*: '),
+            ([bags, '--hold-out', '1'], 'error: --hold-out: expected 0 or at least 2, got 1'),
+            ([bags, '--set', 'sources:=[fix]'],
+             'error: parameter sources: expected at least one of type odometry'),
+            ([bags, '--truth', 'truth/{}.tum'],
+             'error: --truth truth/{}.tum: expected {} at its begin'),
             ([bags, '--trials', '3'], 'error: --trials: expected --sweep'),
             ([bags, '--sweep', 'odom.sigma_distance'], 'error: --sweep: expected NAME=VALUE'),
             ([bags, '--sweep', 'odom.sigma_distance=0.1', '--score', 'truth'],
@@ -296,6 +308,10 @@ def test_an_unknown_scheduler_and_a_folder_in_use(
         2, f'error: {tmp_path}/out: another pose-graph fleet is at work here\n')
     process.communicate(timeout=DEADLINE)
     assert process.returncode == 0
+    # a call that did nothing leaves the table of the last one
+    done = call('fleet', bags, '-o', tmp_path / 'out', '--set', 'frequency:=5.0', '--scheduler',
+                'tpc://127.0.0.1:1')
+    assert (done.code, len(rows_in(tmp_path / 'out'))) == (2, 3)
 
 
 def test_a_sweep_scores_its_points_and_writes_the_best(
@@ -342,6 +358,11 @@ def test_the_truth_may_be_a_file_beside_each_bag(fleet: Any, bags: Path, tmp_pat
     done = fleet(folder, '-o', out, '--truth', '{}.tum')
     assert done.code == 0, done.errors
     assert all(row['truth_max_m'] < 1e-6 for row in rows_in(out).values())
+    # the truth of day00 is not that of a folder whose name only begins so
+    shutil.copytree(folder / 'day00', folder / 'day00.5')
+    done = fleet(folder, '-o', out, '--truth', '{}.tum')
+    assert (done.code, rows_in(out)['day00.5']['status']) == (1, 'failed')
+    shutil.rmtree(folder / 'day00.5')
     (folder / 'day01.tum').write_text((folder / 'day00.tum').read_text())
     assert fleet(folder, '-o', out, '--truth', '{}.tum').counts.startswith('3 drives: ')
     assert rows_in(out)['day01']['is_new'] or rows_in(out)['day01']['status'] == 'failed'

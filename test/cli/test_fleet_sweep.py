@@ -75,6 +75,14 @@ def test_a_point_that_fails_on_the_hard_drive_is_not_the_best() -> None:
     assert found[0].mean == 5.0
 
 
+def test_what_is_unset_in_the_best_point_is_not_in_its_file(tmp_path: Path) -> None:
+    found = sweep.scored([{'datum': []}], [{'a': 1.0}])
+    sweep.write(found, {'datum': [48.0, 11.0], 'frequency': 5.0}, 'truth', tmp_path)
+    text = (tmp_path / sweep.BEST).read_text()
+    assert 'frequency: 5.0' in text
+    assert 'datum' not in text
+
+
 def test_nothing_to_score(tmp_path: Path) -> None:
     found = sweep.scored([{'p': 1.0}], [{'a': None}])
     assert (found[0].drives, found[0].failed) == (0, 0)

@@ -16,6 +16,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import backend_config
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.fleet import overview, sweep, table
 from pose_graph_ros.cli.fleet.kept import key_of, read_map, read_result, UNFINISHED
@@ -46,7 +48,9 @@ def run(options: argparse.Namespace) -> int:
             stopped = error
         finally:
             results.keep_contents()
-        _write(results, options)
+        # a table of nothing is worth less than that of the call before
+        if stopped is None or len(results.found) > 0 or not (options.out / table.FILE).exists():
+            _write(results, options)
         if stopped is not None:
             print(f'stopped with {len(results.missing)} to do; the same call goes on with these',
                   file=sys.stderr)
@@ -59,11 +63,16 @@ def _points(options: argparse.Namespace) -> tuple[list[tuple[Point, Settings]], 
     given = shared.given_parameters(options)
     is_sweep = len(options.sweep) > 0
     if isinstance(options.truth, Path) and not str(options.truth).startswith(BESIDE):
+        if BESIDE in str(options.truth):
+            raise ConfigError(f'--truth {options.truth}: expected {BESIDE} at its begin, as it '
+                              'stands for the whole path of the bag without its suffix')
         options.truth = options.truth.absolute()
     if is_sweep and options.score == 'truth' and options.truth is None:
         raise ConfigError('--score truth: expected --truth, which says where it is')
     if is_sweep and options.score == 'held-out' and options.hold_out == 0:
         options.hold_out = HELD_OUT
+    if options.hold_out == 1 or options.hold_out < 0:
+        raise ConfigError(f'--hold-out: expected 0 or at least 2, got {options.hold_out}')
     if not is_sweep and options.trials is not None:
         raise ConfigError('--trials: expected --sweep, which says between what')
     wanted = sweep.points_of(options.sweep, options.trials, options.seed) if is_sweep else [{}]
@@ -72,6 +81,7 @@ def _points(options: argparse.Namespace) -> tuple[list[tuple[Point, Settings]], 
         try:
             settings = Settings({**given, **point}, {
                 name: getattr(options, name) for name in OF_BAGS})
+            backend_config(checked(settings.given))     # what no bag can be replayed with
             points.setdefault(settings.id, (point, settings))
         except ConfigError as error:
             errors.append(error)
@@ -141,7 +151,9 @@ class Results:
 def _stamp(recording: Recording, settings: Settings) -> str:
     """Return another text if the bag or the file of its truth may have changed; '' if unknown."""
     truth = settings.truth_of(recording.path)
-    files = [truth] if isinstance(truth, Path) and truth.is_file() else []
+    files = [truth] if isinstance(truth, Path) else []
+    if not all(each.is_file() for each in files):   # maybe only workers see it
+        return ''
     return recording.stamp and recording.stamp + stamp_of(files)
 
 
@@ -227,6 +239,6 @@ def _alone_in(out: Path) -> Iterator[None]:
     with (out / '.lock').open('w', encoding='ascii') as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             raise ConfigError(f'{out}: another pose-graph fleet is at work here') from error
         yield

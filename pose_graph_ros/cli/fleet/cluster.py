@@ -45,6 +45,8 @@ def connected(scheduler: str | None, workers: int | None, log: Path) -> Iterator
                 'distributed.scheduler.allowed-failures': TRIES - 1,
                 # on a busy machine a worker takes long to start again
                 'distributed.deploy.lost-worker-timeout': '1h',
+                # one whose memory a large bag has left fragmented would wait for ever
+                'distributed.worker.memory.pause': False,
                 # threads of a worker that look 150 times a second at what the task is doing
                 'distributed.worker.profile.enabled': False,
                 'distributed.admin.tick.interval': '500ms'}

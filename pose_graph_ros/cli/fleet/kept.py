@@ -15,6 +15,7 @@ from typing import Any
 
 DRIVES, UNFINISHED = 'drives', 'unfinished'  # folders
 FILE = 'drive.json'  # row of the table, small map, sizes of the other files, name of the run
+NEEDED = {'path.tum', 'run.json', 'summary.json', 'report.html'}  # by who reads a result
 
 
 def key_of(content: str, settings: str) -> str:
@@ -29,9 +30,11 @@ def read_result(out: Path, key: str, run: str = '') -> dict[str, Any] | None:
     It is new if it was this run that has replayed it.
     """
     folder = out / DRIVES / key
-    with suppress(OSError, ValueError, KeyError):
+    with suppress(OSError, ValueError, KeyError, TypeError):
         told = json.loads((folder / FILE).read_text(encoding='utf-8'))
-        if all((folder / name).stat().st_size == size for name, size in told['sizes'].items()):
+        if told['sizes'].keys() >= NEEDED and all(
+                (folder / name).stat().st_size == size
+                for name, size in told['sizes'].items()):
             return {**told['row'], 'folder': f'{DRIVES}/{key}', 'key': key,
                     'is_new': told['run'] == run}
     return None

@@ -142,4 +142,5 @@ def write(found: Sequence[Scored], given: Mapping[str, Any], score: str, out: Pa
         f'({score}) of {best.drives} drives:',
         f'# {best.mean:.4g} m in the mean, spread {best.spread:.3g} m, worst {best.worst:.4g} m.',
         '/**:', '  ros__parameters:', *(f'    {name}: {yaml_text_of(value)}' for name, value in {
-            **given, **best.parameters}.items()), '']).encode()})
+            # rcl reads no empty list, which stands for unset
+            **given, **best.parameters}.items() if value != []), '']).encode()})

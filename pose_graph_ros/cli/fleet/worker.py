@@ -74,24 +74,27 @@ def _replay(task: Task, settings: Settings, key: str, bag: Path) -> None:
     # a folder for this attempt: another worker may be at the same bag, or have died at it
     aside = Path(task.out, kept.UNFINISHED, task.run, f'{key}.{secrets.token_hex(4)}')
     options = settings.replay_options(bag, settings.truth_of(task.recording.path))
-    done = replay.replayed(options, settings.given)
-    told = document.write_files(done.run, aside, {
-        **done.facts, 'bags': [task.recording.path]})
-    (aside / 'report.html').write_text(render(told), encoding='utf-8')
-    row = row_of(done.run, told) | {
-        'version': settings.version, 'total_s': time.monotonic() - begin,
-        'peak_memory_mb': _peak_memory_mb()}
-    sizes = {each.name: each.stat().st_size for each in aside.iterdir()}
-    (aside / kept.FILE).write_text(json.dumps(finite({
-        'run': task.run, 'sizes': sizes, 'row': row, 'map': small_map(done.run)})) + '\n',
-        encoding='utf-8')
-    place.parent.mkdir(exist_ok=True)
     try:
-        aside.rename(place)
-    except OSError:     # something is there
-        if read_result(Path(task.out), key) is None:
-            shutil.rmtree(place)
+        done = replay.replayed(options, settings.given)
+        told = document.write_files(done.run, aside, {
+            **done.facts, 'bags': [task.recording.path]})
+        (aside / 'report.html').write_text(render(told), encoding='utf-8')
+        row = row_of(done.run, told) | {
+            'version': settings.version, 'total_s': time.monotonic() - begin,
+            'peak_memory_mb': _peak_memory_mb()}
+        sizes = {each.name: each.stat().st_size for each in aside.iterdir()}
+        (aside / kept.FILE).write_text(json.dumps(finite({
+            'run': task.run, 'sizes': sizes, 'row': row, 'map': small_map(done.run)})) + '\n',
+            encoding='utf-8')
+        place.parent.mkdir(exist_ok=True)
+        try:
             aside.rename(place)
+        except OSError:     # something is there
+            if read_result(Path(task.out), key) is None:
+                shutil.rmtree(place)
+                aside.rename(place)
+    finally:    # a disk that is full would stay so
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _forget_peak_memory() -> None:
