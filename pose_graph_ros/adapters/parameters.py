@@ -8,6 +8,7 @@ Check the values of parameters and their changes, say what is wrong with names, 
 
 from array import array
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from itertools import pairwise
@@ -326,10 +327,19 @@ def constraints(parameter: Parameter) -> str:
         'configured' if parameter.change is Change.UNCONFIGURED else '')))
 
 
+def _is_plain(text: str) -> bool:
+    """Return whether YAML takes a text for itself, also in a list, without quotes."""
+    with suppress(ValueError):
+        return bool(yaml_value(f'[{text}]') == [text])
+    return False
+
+
 def yaml_text_of(value: Value) -> str:
     """Return the value of a parameter as YAML."""
     if isinstance(value, list | tuple):
         return f'[{", ".join(map(yaml_text_of, value))}]'
-    text = value if isinstance(value, str) and value != '' else repr(value)
+    if isinstance(value, str):
+        return value if _is_plain(value) else "'" + value.replace("'", "''") + "'"
+    text = repr(value)
     return text.lower() if isinstance(value, bool) else (   # YAML takes 1e-05 for a text
         text.replace('e', '.0e') if isinstance(value, float) and '.' not in text else text)

@@ -9,6 +9,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
+from pose_graph_ros.adapters.parameters import yaml_value
 from pose_graph_ros.cli.fleet import sweep
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -81,6 +82,14 @@ def test_what_is_unset_in_the_best_point_is_not_in_its_file(tmp_path: Path) -> N
     text = (tmp_path / sweep.BEST).read_text()
     assert 'frequency: 5.0' in text
     assert 'datum' not in text
+
+
+def test_texts_of_the_best_point_are_read_again_as_they_are(tmp_path: Path) -> None:
+    named = {'file_folder': 'a: b', 'graph_file': '#1', 'odom.topic': '~/odom', 'map_frame': '5',
+             'odom_frame': "it's", 'sources': ['odom', 'fix, two'], 'state_file': ''}
+    sweep.write(sweep.scored([{'frequency': 1e-5}], [{'a': 1.0}]), named, 'truth', tmp_path)
+    read = yaml_value((tmp_path / sweep.BEST).read_text())
+    assert read['/**']['ros__parameters'] == named | {'frequency': 1e-5}
 
 
 def test_nothing_to_score(tmp_path: Path) -> None:
