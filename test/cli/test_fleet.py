@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 def cluster() -> Iterator[LocalCluster]:
     """One worker, which many calls share."""
     with LocalCluster(n_workers=1, threads_per_worker=1, host='127.0.0.1',
-                      dashboard_address=None, silence_logs=50) as cluster:
+                      dashboard_address='127.0.0.1:0', silence_logs=50) as cluster:
         yield cluster
 
 
@@ -243,7 +243,7 @@ def test_a_scheduler_that_is_lost_keeps_what_is_done(
         'import time\nfrom distributed import LocalCluster\n'
         "if __name__ == '__main__':\n"
         "    made = LocalCluster(n_workers=1, threads_per_worker=1, host='127.0.0.1',\n"
-        '                        dashboard_address=None)\n'
+        "                        dashboard_address='127.0.0.1:0')\n"
         '    print(made.scheduler_address, flush=True)\n    time.sleep(600)\n')
     scheduler = subprocess.Popen([FLEET[0], script], stdout=subprocess.PIPE, text=True,
                                  stderr=subprocess.DEVNULL)
