@@ -5,12 +5,13 @@ What `pose-graph fleet` costs beside the replays themselves; the figures of docs
 
     .venv/bin/python -m benchmark.fleet [--bags 200] [--seconds 120]
 
-Simulated drives are replayed with one and with two processes, and one after the other in this
-process, which writes the same files but for the reports. Then a scheduler of its own is given
-tasks, to see what it holds in memory of each; and rows are added as a call holds them.
+A scheduler of its own is given tasks, to see what it holds in memory of each; and rows are added
+as a call holds them. Then simulated drives are replayed with one and with two processes, and with
+one worker while this process replays the same, and writes the same files but for the reports.
 """
 
 import argparse
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import redirect_stdout
 import io
 import json
@@ -48,15 +49,37 @@ def write_bags(folder: Path, count: int, seconds: int) -> None:
                          '--duration', str(seconds)]) == 0
 
 
-def alone(bags: Path, out: Path, half: int) -> list[float]:
-    """Replay every other bag in this process, one after the other; return the times [s]."""
+def replay_alone(bags: Path, out: Path, until: Future[Any]) -> list[float]:
+    """Replay bags in this process until something else is done; return the time of each [s]."""
     settings, times = Settings({}, USUAL), []
-    for each in find_recordings([str(bags)], out)[half::2]:
+    for each in find_recordings([str(bags)], out):
+        if until.done():
+            break
         begin = time.perf_counter()
         done = replayed(settings.replay_options(Path(each.path), None), {})
         document.write_files(done.run, out / each.name, done.facts)
         times.append(time.perf_counter() - begin)
     return times
+
+
+def overhead(bags: Path, folder: Path) -> tuple[float, float]:
+    """
+    Return the time that a drive takes of one worker, and of this process at the same time [s].
+
+    What else a machine does changes both alike, and from minute to minute by more than they differ.
+    """
+    out = folder / 'worker'
+    with ThreadPoolExecutor() as pool:
+        call = pool.submit(fleet, bags, out, 1)
+        while len([*out.glob('drives/*')]) < 2:
+            time.sleep(0.1)
+        begin = time.time()
+        times = replay_alone(bags, folder / 'alone', call)
+        end = time.time()
+        call.result()
+    ends = sorted(at for path in out.glob('drives/*/drive.json')
+                  if begin <= (at := path.stat().st_mtime) <= end)
+    return (ends[-1] - ends[0]) / (len(ends) - 1), sum(times[1:]) / (len(times) - 1)
 
 
 def fleet(bags: Path, out: Path, workers: int) -> dict[str, float]:
@@ -135,20 +158,15 @@ def main() -> None:
         write_bags(folder / 'bags', options.bags, options.seconds)
         size = sum(path.stat().st_size for path in (folder / 'bags').rglob('*'))
         print(f'{options.bags} bags of {options.seconds} s, {1e-6 * size / options.bags:.2f} MB')
-        # what a machine does beside changes from minute to minute, so half before and half after
-        times, found = alone(folder / 'bags', folder / 'alone', 0), dict[int, dict[str, float]]()
-        found[1] = fleet(folder / 'bags', folder / 'out1', 1)
-        times += alone(folder / 'bags', folder / 'alone', 1)
-        found[2] = fleet(folder / 'bags', folder / 'out2', 2)
-        whole = sum(times)
-        print(f'one after the other in one process: {whole:.1f} s')
+        found = {n: fleet(folder / 'bags', folder / f'out{n}', n) for n in (1, 2)}
         for n, each in found.items():
             print(f'fleet --workers {n}:', ', '.join(
                 f'{key} {value:.1f}' for key, value in each.items()))
-        one, two = found[1], found[2]
-        print(f'speed-up of two: {one["whole"] / two["whole"]:.2f} of the call, '
-              f'{one["replaying"] / two["replaying"]:.2f} of the replays')
-        print(f'overhead a bag: {1e3 * (one["replaying"] - whole) / options.bags:.0f} ms')
+        print(f'speed-up of two: {found[1]["whole"] / found[2]["whole"]:.2f} of the call, '
+              f'{found[1]["replaying"] / found[2]["replaying"]:.2f} of the replays')
+        worker, alone = overhead(folder / 'bags', folder)
+        print(f'a drive takes {1e3 * worker:.0f} ms of a worker, {1e3 * alone:.0f} ms of a process '
+              f'that replays beside it: {1e3 * (worker - alone):.0f} ms more')
 
 
 if __name__ == '__main__':

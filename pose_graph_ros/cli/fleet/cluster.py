@@ -49,7 +49,9 @@ def connected(scheduler: str | None, workers: int | None, log: Path) -> Iterator
                 'distributed.worker.memory.pause': False,
                 # threads of a worker that look 150 times a second at what the task is doing
                 'distributed.worker.profile.enabled': False,
-                'distributed.admin.tick.interval': '500ms'}
+                'distributed.admin.tick.interval': '500ms',
+                # memory that is given back after each small array has to be fetched again
+                'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**27}
     # what dies is told below, by bag
     for handler in logging.getLogger('distributed').handlers:
         handler.setLevel(logging.CRITICAL)
