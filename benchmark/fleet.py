@@ -165,8 +165,8 @@ def main() -> None:
         print(f'speed-up of two: {found[1]["whole"] / found[2]["whole"]:.2f} of the call, '
               f'{found[1]["replaying"] / found[2]["replaying"]:.2f} of the replays')
         worker, alone = overhead(folder / 'bags', folder)
-        print(f'a drive: {1e3 * worker:.0f} ms of a worker, {1e3 * alone:.0f} ms of a process that '
-              f'replays beside it, {1e3 * (worker - alone):.0f} ms more')
+        print(f'a drive: {1e3 * worker:.0f} ms of a worker, {1e3 * alone:.0f} ms of a process '
+              f'that replays beside it, {1e3 * (worker - alone):.0f} ms more')
 
 
 if __name__ == '__main__':
