@@ -217,7 +217,11 @@ def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
 def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
     write_drives(tmp_path / 'bags', 12)
     out = tmp_path / 'out'
-    words = [*FLEET, str(tmp_path / 'bags'), '-o', str(out), '--workers', '2']
+    # a job in the background, as the tests may be, ignores the signal
+    code = ('import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+            'from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))')
+    words = [FLEET[0], '-c', code, 'fleet', str(tmp_path / 'bags'), '-o', str(out),
+             '--workers', '2']
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
     wait_until(lambda: finished(out) >= 3, process)
