@@ -116,9 +116,9 @@ def _spread(values: Any) -> float:
 def lines(found: Sequence[Scored]) -> Iterator[str]:
     """Yield a table for people."""
     names = [*found[0].parameters]
-    head = [*names, 'drives', 'mean', 'spread', 'worst', 'worse than the best by']
+    head = [*names, 'drives', 'failed', 'mean', 'spread', 'worst', 'worse than the best by']
     rows = [[*(yaml_text_of(each.parameters[name]) for name in names), str(each.drives),
-             *(f'{value:.3f}' for value in (each.mean, each.spread, each.worst)),
+             str(each.failed), *(f'{value:.3f}' for value in (each.mean, each.spread, each.worst)),
              '' if each is found[0] or math.isnan(each.worse_by) else
              f'{each.worse_by:.3f} +- {each.standard_error:.3f}'] for each in found]
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]

@@ -35,8 +35,8 @@ def result_of(task: Task) -> dict[str, Any]:
     logging.getLogger('pose_graph_ros').setLevel(logging.ERROR)  # what is odd is in the findings
     content, bag = '', Path(task.recording.path)
     try:
+        settings = read_settings(Path(task.out), task.settings)     # the folder is shared
         _compile_once(Path(task.out))
-        settings = read_settings(Path(task.out), task.settings)
         with local_copy(task.recording) as bag:
             truth = settings.truth_of(task.recording.path)
             content = content_of([*files_of(bag), *([truth] if isinstance(truth, Path) else [])])
