@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A migrated set-up of robot_localization on a robot: the same names, and a pose that is true."""
 
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 import re
 import shlex
@@ -19,6 +19,7 @@ from geographic_msgs.msg import GeoPoint
 from harness import Client, fix, imu, NodeProcess, odometry, RELIABLE, stamp_ns, yaw
 from nav_msgs.msg import Odometry
 import numpy as np
+from rclpy.node import NodeNameNonExistentError
 from robot_localization import srv
 from sensor_msgs.msg import Imu
 
@@ -128,8 +129,11 @@ def check_names(client: Client) -> None:
         of = {'published': client.node.get_publisher_names_and_types_by_node,
               'read': client.node.get_subscriber_names_and_types_by_node,
               'offered': client.node.get_service_names_and_types_by_node}[kind]
-        return dict(of('pose_graph', '/') + (
-            of('_services', '/pose_graph') if kind == 'offered' else []))
+        found: dict[str, list[str]] = {}
+        for node in ('pose_graph', '/'), ('_services', '/pose_graph'):
+            with suppress(NodeNameNonExistentError):    # whose news has not come yet
+                found.update(of(*node))
+        return found
     for kind, theirs in (('published', PUBLISHED), ('read', READ), ('offered', OFFERED)):
         # on a busy machine names are heard of one after the other
         client.spin_until(lambda kind=kind, theirs=theirs: all(
