@@ -313,11 +313,11 @@ class SmootherConfig(Settings):
 
     POSITIVE = ('max_iterations',)
 
-    alpha: float = 0.02  # back-substitution stops at nodes that move by less than this [sigma]
+    alpha: float = 0.035  # back-substitution stops at nodes that move by less than this [sigma]
     # upper limit of the squared linearisation error that a step may leave [sigma^2]
-    budget: float = 0.001
+    budget: float = 0.003
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
-    budget_share: float = 6e-6
+    budget_share: float = 3e-5
     max_iterations: int = 5  # maximum number of iterations per update; the next update continues
 
 

@@ -112,9 +112,11 @@ def test_a_calibrated_graph_is_saved_and_goes_on(tmp_path: Path) -> None:
     for each in (loaded, same):
         drive.fed(each, 150.0, 200.0)
     np.testing.assert_array_equal(loaded.graph.poses, same.graph.poses)
+    drive.fed(backend, 150.0, 200.0)
+    for each in (same, backend):
+        each.optimize()
     np.testing.assert_allclose(
-        same.estimate().T_map_base,
-        drive.fed(backend, 150.0, 200.0).estimate().T_map_base, atol=1e-3)
+        same.estimate().T_map_base, backend.estimate().T_map_base, atol=1e-3)
     # without it, states and edges stay, and new nodes have plain ones
     plain = PoseGraphBackend.restored(UNCALIBRATED, read_graph(tmp_path / 'graph'))
     drive.fed(plain, 150.0, 200.0)

@@ -98,6 +98,16 @@ def spread(_context: Any, number: Any) -> Any:
     return VECTOR(types.float64), codegen
 
 
+@_intrinsic
+def total(_context: Any, vector: Any) -> Any:
+    """Return the sum of the four elements."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        a, b, c, d = (builder.extract_element(arguments[0], ir.IntType(32)(k))
+                      for k in range(WIDTH))
+        return builder.fadd(builder.fadd(a, c), builder.fadd(b, d))
+    return types.float64(VECTOR), codegen
+
+
 def _of_vectors(n: int, build: Callable[..., Any]) -> Callable[..., Any]:
     """Return an operation on n vectors, element by element, given what builds it."""
     def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:

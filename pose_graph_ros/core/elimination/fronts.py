@@ -17,7 +17,16 @@ keeps its rows of R and its update matrix as upper triangles without gaps (`grap
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.compiled.simd import copy, fnmadd, load, spread, store, times, WIDTH
+from pose_graph_ros.core.compiled.simd import (
+    copy,
+    fnmadd,
+    load,
+    spread,
+    store,
+    times,
+    total,
+    WIDTH,
+)
 from pose_graph_ros.core.graph.pools import row_start
 
 # Smallest pivot, as a fraction of what the constraints of its node add to it. A smaller one has
@@ -146,14 +155,26 @@ def backward_rows(values, rows, n, x, stored):  # type: ignore[no-untyped-def]
     y is the right-hand side that is stored with R.
     """
     for k in range(rows - 3, -1, -3):
-        r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
-                      values[row_start(k + 2, n):])
-        a, b, c = (r0[n], r1[n], r2[n]) if stored else (x[k], x[k + 1], x[k + 2])
-        for m in range(k + 3, n):
-            a -= r0[m] * x[m]
-            b -= r1[m] * x[m]
-            c -= r2[m] * x[m]
-        c *= r2[k + 2]
-        b = (b - r1[k + 2] * c) * r1[k + 1]
-        x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
+        p, q, r = row_start(k, n), row_start(k + 1, n), row_start(k + 2, n)
+        u = v = w = spread(0.0)
+        m = k + 3
+        while m + WIDTH <= n:
+            y = load(x, m)
+            u = fnmadd(u, load(values, p + m), y)
+            v = fnmadd(v, load(values, q + m), y)
+            w = fnmadd(w, load(values, r + m), y)
+            m += WIDTH
+        a, b, c = total(u), total(v), total(w)
+        if stored:
+            a, b, c = a + values[p + n], b + values[q + n], c + values[r + n]
+        else:
+            a, b, c = a + x[k], b + x[k + 1], c + x[k + 2]
+        while m < n:
+            a -= values[p + m] * x[m]
+            b -= values[q + m] * x[m]
+            c -= values[r + m] * x[m]
+            m += 1
+        c *= values[r + k + 2]
+        b = (b - values[q + k + 2] * c) * values[q + k + 1]
+        x[k] = (a - values[p + k + 1] * b - values[p + k + 2] * c) * values[p + k]
         x[k + 1], x[k + 2] = b, c

@@ -27,6 +27,8 @@ from pose_graph_ros.core.graph.rows import forget_touched
 
 # Number of the newest nodes that are eliminated last, since the next constraints involve them.
 NEWEST_LAST = 10
+# More than there are nodes.
+_MANY = 2**32
 # Limits of amalgamation: explicit zero blocks and frontal nodes of a merged clique. They differ
 # from those of the incremental smoother, as every clique is eliminated in every iteration here.
 RELAXED_ZEROS = 8
@@ -51,21 +53,23 @@ CLIQUES = types.NamedTuple((*[INDICES] * 4, *[INTEGER] * 3), Cliques)
 
 
 @kernel
-def newest_last(affected, newest):  # type: ignore[no-untyped-def]
+def newest_last(affected, newest, fixed):  # type: ignore[no-untyped-def]
     """
-    Return how many of the newest nodes were moved to the end of the list, in order of age.
+    Return how many of the affected nodes were moved to the end of the list, to stay near the root.
 
-    The very last is the newest pose, if it is affected: biases may have been added after it, but
-    the next odometry edge starts at it.
+    They are the newest ones, in order of age. The very last is the newest pose: biases may have
+    been added after it, but the next odometry edge starts at it. Before it comes a fixed node,
+    since no frame of a clique above it turns, and a closure may turn all of the map about it.
     """
     n = len(affected)
     n_last = min(NEWEST_LAST, n)
     for k in range(n_last):
-        best = 0
-        for i in range(1, n - k):
-            if affected[best] != newest and (
-                    affected[i] > affected[best] or affected[i] == newest):
-                best = i
+        best, latest = 0, np.int64(-1)
+        for i in range(n - k):
+            v = np.int64(affected[i])
+            age = v + (2 * _MANY if v == newest else _MANY if v == fixed else 0)
+            if age > latest:
+                best, latest = i, age
         last = n - k - 1
         affected[best], affected[last] = affected[last], affected[best]
     return n_last
@@ -151,7 +155,7 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
 def analyse(head):  # type: ignore[no-untyped-def]
     """Return the cliques of a fill-reducing order of all nodes, without storing them."""
     order = np.arange(head[tb.N_NODES]).astype(np.int32)
-    n_last = newest_last(order, head[tb.NEWEST])
+    n_last = newest_last(order, head[tb.NEWEST], head[tb.FIXED])
     priors = prior_rows.all_priors(head)
     _, start, adjacency = structure(head, np.empty(0, np.int32), priors, order)
     first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(

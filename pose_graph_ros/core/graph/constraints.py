@@ -183,9 +183,9 @@ class Factors:
 
     @classmethod
     def joined(cls, tables: 'Sequence[Factors]') -> 'Factors':
-        """Return one table with the rows of several, in order."""
-        if len(tables) == 0:
-            return cls()
+        """Return one table with the rows of several, in order; a single one itself."""
+        if len(tables) <= 1:
+            return tables[0] if len(tables) == 1 else cls()
         return cls.of(np.concatenate([
             table.records.view(_AS_BYTES) for table in tables]).view(RECORD))
 

@@ -141,6 +141,20 @@ def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
             transaction_log.log_node(head, v)
             nodes[v].fixed = 1 if fixed else 0
             touch(head, v)
+    if fixed or head[tb.FIXED] >= 0:
+        _find_fixed(head)
+
+
+@kernel
+def _find_fixed(head):  # type: ignore[no-untyped-def]
+    """Look for a fixed node that does not leave, unless the known one is."""
+    nodes, v = tb.nodes(head), np.int64(max(head[tb.FIXED], 0))
+    for _ in range(head[tb.N_NODES]):
+        if nodes[v].fixed != 0 and nodes[v].factor_list != tb.LEAVES:
+            head[tb.FIXED] = v
+            return
+        v = (v + 1) % head[tb.N_NODES]
+    head[tb.FIXED] = -1
 
 
 @kernel(signature=(tb.HEAD, jit.ROWS, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
@@ -272,6 +286,8 @@ def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
     while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
         v -= 1
     head[tb.NEWEST] = v
+    if head[tb.FIXED] >= 0:
+        _find_fixed(head)
 
 
 def compact(memory: tb.Memory) -> Gone:
@@ -306,7 +322,7 @@ def compact(memory: tb.Memory) -> Gone:
         left = rows_now[memory[name][:head[counter]]]
         left = left[left >= 0]
         memory[name][:len(left)], head[counter] = left, len(left)
-    head[tb.NEWEST] = of_node[head[tb.NEWEST]]
+    head[tb.NEWEST], head[tb.FIXED] = of_node[head[tb.NEWEST]], of_node[head[tb.FIXED]]
     head[tb.N_LEAVING] = 0
     return Gone(nodes_gone, factors_gone)
 

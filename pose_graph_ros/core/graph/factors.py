@@ -83,6 +83,18 @@ NO_THIRD = ((0.0, 0.0, 0.0), 0.0)
 
 
 @kernel(forceinline=True)
+def turned_by(angle):  # type: ignore[no-untyped-def]
+    """Return cosine - 1 and sine of an angle that is small as a rule, exact to rounding."""
+    if abs(angle) < 0.1:    # by their series
+        square = angle * angle
+        return (-square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
+                    1 / 40320 - square / 3628800)))),
+                angle * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
+                    1 / 5040 - square * (1 / 362880 - square / 39916800))))))
+    return math.cos(angle) - 1.0, math.sin(angle)
+
+
+@kernel(forceinline=True)
 def is_relative(kind):  # type: ignore[no-untyped-def]
     """Tell whether an error lies in the frame of the pose that was measured from node i."""
     return kind < BIAS or TURN < kind < RANGE
@@ -269,13 +281,7 @@ def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
     if is_relative(kind):
         # d in the axes of the linearized frame, and by how much the turn changes it
         qx, qy = c_bar * dx + s_bar * dy, c_bar * dy - s_bar * dx
-        if abs(turn) < 0.1:     # as a rule: cos - 1 and sin by their series, exact to rounding
-            versine = -turned * (0.5 - turned * (1 / 24 - turned * (1 / 720 - turned * (
-                1 / 40320 - turned / 3628800))))
-            sine = turn * (1.0 - turned * (1 / 6 - turned * (1 / 120 - turned * (
-                1 / 5040 - turned * (1 / 362880 - turned / 39916800)))))
-        else:
-            versine, sine = math.cos(turn) - 1.0, math.sin(turn)
+        versine, sine = turned_by(turn)
         px, py = versine * qx + sine * qy, versine * qy - sine * qx
         ax, ay = qx + px, qy + py
         ex, ey = ax - f.constants[0] + by_x, ay - f.constants[1] + by_y

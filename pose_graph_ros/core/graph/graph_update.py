@@ -58,7 +58,7 @@ class GraphUpdate(NamedTuple):
     @property
     def edits(self) -> bool:
         """Whether it edits what there is, by any part from `fix` on."""
-        return any(len(part) > 0 for part in self[5:])
+        return any(map(len, self[5:]))
 
 
 class Gone(NamedTuple):

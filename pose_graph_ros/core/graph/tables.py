@@ -179,6 +179,7 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 #       by more than alpha sigmas, and of cliques whose frames turned; their lists are in work_i
 #   NODE_ROOM, FACTOR_ROOM: capacity of all tables in nodes and factors
 #   NEWEST: newest node that is a pose, or -1
+#   FIXED: a fixed node, or -1; it stays near the root, see `symbolic.newest_last`
 #   SINCE: first stamp BUILT of the cliques that back-substitution has to solve for
 #   REFINED: first ITERATION after the last refinement; cliques BUILT before it are at the optimum
 #   LISTED: UPDATE that has listed all that the next iteration of a refinement linearizes again
@@ -189,11 +190,12 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 # A rollback restores the first ones, up to LOOSE.
-(N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, NEXT_NODE, NEXT_FACTOR, N_LEAVING,
- N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END, UPDATE,
- ITERATION, FRONT_SERIAL, NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
+(N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, FIXED, NEXT_NODE, NEXT_FACTOR,
+ N_LEAVING, N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END,
+ UPDATE, ITERATION, FRONT_SERIAL,
+ NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
  N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
- REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 40)
+ REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 41)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -277,7 +279,7 @@ class Memory:
 
     def __init__(self, another: 'Memory | None' = None) -> None:
         self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
-        self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[LOOSE] = -1
+        self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[FIXED] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:

@@ -17,8 +17,6 @@ to the *drift* of the clique. Above `FREE_FRACTION` of alpha the clique is solve
 its drift is added to that of its children.
 """
 
-import math
-
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import fetch
 from pose_graph_ros.core.elimination import clique_frames
@@ -60,7 +58,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
         return      # a refinement checks all nodes
     # approximate squared linearization error due to the turn since the last check
     turn2 = (dth - phi - f.checked_turn) ** 2
-    error2 = turn2 * (turn2 * f.scale_r * f.scale_r + USUAL_ENERGY)
+    error2 = 0.2 * turn2 * (turn2 * f.scale_r * f.scale_r + USUAL_ENERGY)
     if (error2 > scalars.share or moved > 100.0 * alpha or head[tb.SINCE] < head[tb.ITERATION]):
         f.checked_turn = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
@@ -92,7 +90,8 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
     x = work_f[:n]
     cos, sin, px, py = 1.0, 0.0, 0.0, 0.0
     if phi != 0.0:
-        cos, sin = math.cos(phi), math.sin(phi)
+        versine, sin = factors.turned_by(phi)
+        cos = 1.0 + versine
         f = nodes[members[n_frontal]]
         px, py = f.pose[0], f.pose[1]
     for k in range(n_frontal, n_frontal + n_separator):
@@ -142,7 +141,7 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
     pivot_x, pivot_y = goal_x + pivot_x * weight, goal_y + pivot_y * weight
     if len(members) == 1:
         return 0.0, turn, pivot_x, pivot_y, goal_x, goal_y
-    versine, sine = math.cos(turn) - 1.0, math.sin(turn)
+    versine, sine = factors.turned_by(turn)
     deviation = 0.0
     for v in members:
         f = nodes[v]
@@ -164,7 +163,8 @@ def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
     """Return the number of nodes at or below a clique, after moving them by a rigid motion."""
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
     _, turn, pivot_x, pivot_y, goal_x, goal_y = motion
-    cos, sin = math.cos(turn), math.sin(turn)
+    versine, sine = factors.turned_by(turn)
+    shift_x, shift_y = goal_x - pivot_x, goal_y - pivot_y
     bottom, moved = depth, 0
     stack[depth] = c
     depth += 1
@@ -176,9 +176,10 @@ def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
             transaction_log.log_node(head, v)
             f = nodes[v]
             x, y = f.pose[0] - pivot_x, f.pose[1] - pivot_y
-            x, y = cos * x - sin * y + goal_x, sin * x + cos * y + goal_y
-            dx, dy = x - f.pose[0], y - f.pose[1]
-            f.pose[0], f.pose[1] = x, y
+            dx = shift_x + versine * x - sine * y
+            dy = shift_y + sine * x + versine * y
+            f.pose[0] += dx
+            f.pose[1] += dy
             f.pose[2] = factors.wrap(f.pose[2] + turn)
             f.delta[0] += dx
             f.delta[1] += dy

@@ -13,7 +13,7 @@ other cliques remain, and with them estimate and covariances.
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import unlink
@@ -49,7 +49,8 @@ def far_from_linear(head, leaving):  # type: ignore[no-untyped-def]
     """
     Tell whether the linearization errors of the constraints of leaving nodes are above a budget.
 
-    It is that of a step that moves as many nodes. An edge between two of them counts twice.
+    It is a part of that of a step that moves as many nodes, as what leaves keeps its linearization
+    for good. An edge between two of them counts twice.
     """
     scalars, error2 = tb.scalars(head)[0], 0.0
     for v in leaving:
@@ -57,25 +58,27 @@ def far_from_linear(head, leaving):  # type: ignore[no-untyped-def]
         while at >= 0:
             error2 += tb.factors(head)[at >> 2].error2
             at = tb.factors(head)[at >> 2].next[at & 3]
-    return error2 > min(scalars.budget, scalars.share * len(leaving))
+    return error2 > 0.1 * min(scalars.budget, scalars.share * len(leaving))
 
 
-@kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
-def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, INTEGERS, FLAG), allocates=True)
+def touch_mixed(head, leaving, all_of_them):  # type: ignore[no-untyped-def]
     """
     Touch all cliques that have to be eliminated again before nodes can leave; tell whether any.
 
     These are the cliques with a leaving node that hold, or are above, one that remains. Their
-    leaving nodes are ordered before all others. The caller has begun an update.
+    leaving nodes are ordered before all others, or `all_of_them` are. The caller has begun an
+    update.
     """
     cliques = tb.cliques(head)
     nodes, pool_i, stack = tb.nodes(head), tb.pool_i(head), tb.work_i(head)
     whole, _ = _whole(head, leaving)
     mixed = False
     for v in leaving:
-        if whole[nodes[v].clique]:
+        mixed = mixed or not whole[nodes[v].clique]
+    for v in leaving:
+        if not mixed or (whole[nodes[v].clique] and not all_of_them):
             continue
-        mixed = True
         transaction_log.log_node(head, v)
         touch(head, v)
         nodes[v].touched = ORDERED_FIRST

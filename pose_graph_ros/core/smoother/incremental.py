@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The incremental smoother; `docs/solver.md` describes the method."""
 
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +44,22 @@ class Refinement(NamedTuple):
     moved: float    # largest change of a coordinate of a position [m]
 
 
+class _Editing:
+    """Begins an update of a graph, which is rolled back if an exception ends the context."""
+
+    __slots__ = ('_graph',)
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+
+    def __enter__(self) -> None:
+        self._graph.begin()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            self._graph.rollback()
+
+
 _UNIT = np.eye(3)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', eliminated=1, visited=1, iterations=1)
 
@@ -82,19 +97,9 @@ class IncrementalSmoother:
         `trial` can find the optimum part by part. A GraphUpdateError, for a part that does not fit
         the graph, leaves the graph unchanged, as any other exception does.
         """
-        with self._editing():
+        with _Editing(self.graph):
             self.graph.apply(update)
             return self._step(step.FIRST, fall_back=fall_back)
-
-    @contextmanager
-    def _editing(self) -> Iterator[None]:
-        """Begin an update, and roll it back if an exception ends it."""
-        self.graph.begin()
-        try:
-            yield
-        except BaseException:
-            self.graph.rollback()
-            raise
 
     def append(self, update: GraphUpdate) -> bool:
         """
@@ -103,7 +108,7 @@ class IncrementalSmoother:
         It is not, and nothing has changed, if the update asks for anything to be eliminated.
         Raises GraphUpdateError as `update` does.
         """
-        with self._editing():
+        with _Editing(self.graph):
             self.graph.apply(update)
         if self.graph.has_touched:
             self.graph.rollback()
@@ -134,7 +139,7 @@ class IncrementalSmoother:
         """Do an iteration in a transaction; return the code of `step.refine`."""
         self._memory.head[tb.HEEDS] = heeds
         while True:     # each time with more memory
-            with self._editing():
+            with _Editing(self.graph):
                 code: int = step.refine(self._memory.head)
             if code in (tree_update.DONE, tree_update.UNFINISHED):
                 self.graph.commit()
@@ -225,9 +230,9 @@ class IncrementalSmoother:
         the newest pose, and if that step fails; ValueError as `refine` does.
         """
         rows, head = self.linearize(nodes), self._memory.head
-        for _ in range(4):  # a step may touch further nodes that wait to be linearized
-            with self._editing():
-                if not forgetting.touch_mixed(head, rows):
+        for again in (False, True, True):   # what a step linearizes again may mix others
+            with _Editing(self.graph):
+                if not forgetting.touch_mixed(head, rows, again):
                     self.graph.rollback()
                     break
                 result = self._step(step.FIRST)

@@ -83,14 +83,14 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
             break
         # The iterations have diverged if the error is large, in sigma^2 and against the lowest
         # chi2 of the step (a false constraint raises chi2 and all errors with it), and either no
-        # iteration remains, the last one has not halved it, or another can only increase it.
+        # iteration remains, the last one has doubled it, or another can only increase it.
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
         before, scalars.error2_before = scalars.error2_before, error2
         scalars.lowest = min(scalars.lowest, scalars.chi2)
         large = error2 > 1.0 and error2 > 1e-3 * scalars.lowest
         if entered == AFTER_BATCH:  # it may swing about what the batch has found, but not leave it
             large = large and scalars.chi2 > 2.0 * scalars.lowest + 1.0
-        if large and (out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6):
+        if large and (out_of_iterations or 0.0 < before < 0.5 * error2 or not error2 < 1e6):
             return tree_update.DIVERGED
         if out_of_iterations:
             break
@@ -123,8 +123,8 @@ def _iterate(head):  # type: ignore[no-untyped-def]
     forget_touched(head)
     head[tb.N_ELIMINATED], head[tb.SINCE] = len(affected), head[tb.REFINED]
     _solve_and_check(head)
-    # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
-    if not scalars.chi2 <= scalars.lowest + 0.1 or head[tb.ROUND] >= 20:
+    # Gauss-Newton goes uphill, by at most 1 sigma^2, where it swings a soft mode
+    if not scalars.chi2 <= scalars.lowest + 1.0 or head[tb.ROUND] >= 20:
         return tree_update.DIVERGED
     head[tb.ROUND] += 1
     scalars.lowest = min(scalars.lowest, scalars.chi2)
@@ -185,11 +185,11 @@ def _forget_waiting(head):  # type: ignore[no-untyped-def]
 @kernel
 def _relinearize(head):  # type: ignore[no-untyped-def]
     """
-    Linearize the worst waiting factors again, until 0.4 of the budget remains.
+    Linearize the worst waiting factors again, until 0.1 of the budget remains.
 
     The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
-    allowed = 0.4 * _budget(head)
+    allowed = 0.1 * _budget(head)
     waiting, cliques = tb.waiting(head), tb.cliques(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
     bins = tb.work_f(head)[:64]
@@ -278,7 +278,8 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
             if f.owner != owner:
                 owner = f.owner
                 phi = clique_frames.present_turn(head, owner)
-                frame = (phi, math.cos(phi), math.sin(phi))
+                versine, sine = factors.turned_by(phi)
+                frame = (phi, 1.0 + versine, sine)
             transaction_log.log_factor(head, e)
             scalars.chi2 -= f.energy
             factors.check(head, e, frame)

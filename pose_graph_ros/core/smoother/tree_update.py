@@ -14,7 +14,13 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
-from pose_graph_ros.core.elimination.symbolic import in_postorder, newest_last, plant, structure
+from pose_graph_ros.core.elimination.symbolic import (
+    in_postorder,
+    NEWEST_LAST,
+    newest_last,
+    plant,
+    structure,
+)
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
 # Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
@@ -40,7 +46,7 @@ def lacks_memory(head, need_f, need_i, need_work):  # type: ignore[no-untyped-de
 @kernel(allocates=True)
 def mark(head):  # type: ignore[no-untyped-def]
     """
-    Mark the cliques from all touched nodes up to the roots.
+    Mark the cliques from all touched nodes up to the roots, and for a new order from a fixed one.
 
     Return these cliques, for each touched node those from it up that were not marked yet, and the
     affected nodes: their frontal nodes and the touched nodes without a clique, but for those that
@@ -51,12 +57,20 @@ def mark(head):  # type: ignore[no-untyped-def]
     stamp = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = stamp
     marked = np.empty(64, np.int32)
-    n_marked = 0
-    n_affected = 0
-    for s in range(head[tb.N_TOUCHED]):
-        c = nodes[touched[s]].clique
-        if c < 0:
-            n_affected += 1
+    n_marked = n_affected = 0
+    n_touched, fixed = head[tb.N_TOUCHED], head[tb.FIXED]
+    if head[tb.STRUCTURE] == 0:
+        fixed = -1
+    for s in range(n_touched + 1):
+        if s < n_touched:
+            v = np.int64(touched[s])
+            if nodes[v].clique < 0:
+                n_affected += 1
+            if nodes[v].touched == ORDERED_FIRST:
+                fixed = -1  # cliques of other nodes that leave stay as they are
+        else:
+            v = fixed if n_affected > NEWEST_LAST else np.int64(-1)
+        c = np.int64(nodes[v].clique) if v >= 0 else np.int64(-1)
         while c >= 0 and cliques[c].marked != stamp:
             cliques[c].marked = stamp
             if n_marked == len(marked):
@@ -93,7 +107,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         if nodes[affected[k]].touched == ORDERED_FIRST:
             affected[n_leaving], affected[k] = affected[k], affected[n_leaving]
             n_leaving += 1
-    n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
+    n_last = newest_last(affected[n_leaving:], head[tb.NEWEST], head[tb.FIXED])
     loose = np.empty(head[tb.N_PRIORS], np.int32)
     c, n_loose = head[tb.LOOSE], 0
     while c >= 0:
@@ -102,7 +116,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     orphans, start, adjacency = structure(head, marked, loose[:n_loose], affected)
     cliques = in_postorder(
         affected, minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency),
-        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
+        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, True)
     if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
                     head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
         return MORE_MEMORY
