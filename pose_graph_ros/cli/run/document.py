@@ -201,8 +201,8 @@ def _lines_for_people(run: Run, facts: Mapping[str, Any], told: Mapping[str, Any
     drive, estimate, report = run.drive, run.estimate, run.report
     counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
     lines = [f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
-             f'observed nodes in {run.seconds:.2f} s; {report.status.value}, chi2 '
-             f'{report.chi2:.6g}; {estimate.alignment.value}']
+             f'observed nodes in {run.seconds:.2f} s; at the end all optimised: '
+             f'{report.status.value}, chi2 {report.chi2:.6g}; {estimate.alignment.value}']
     errors = estimate.odometry_errors
     if errors != AS_CLAIMED:
         corrected = [f'{short(factor * value, 3)} +- {short(factor * sigma, 2)} {unit}'

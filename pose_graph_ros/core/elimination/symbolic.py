@@ -10,8 +10,8 @@ so for a whole graph, once for all iterations of a batch optimisation.
 Cliques are in postorder: children precede their parent, and each subtree is contiguous. So the
 elimination is a loop over all cliques, the back-substitution is the same loop in reverse, and the
 update matrices of the children are still in the processor's cache when the parent needs them.
-In a whole graph, separators are sorted by the order of elimination. Columns that are adjacent are
-therefore mostly adjacent in the parent's front as well, and are added in runs.
+Separators are sorted by the order of elimination. Columns that are adjacent are therefore mostly
+adjacent in the parent's front as well, and are added in runs.
 """
 
 from typing import Any, NamedTuple
@@ -160,7 +160,7 @@ def analyse(head):  # type: ignore[no-untyped-def]
     _, start, adjacency = structure(head, np.empty(0, np.int32), priors, order)
     first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(
         order, minimum_degree(len(order), len(priors), 0, n_last, start, adjacency), 0,
-        RELAXED_ZEROS, RELAXED_FRONTAL, True)
+        RELAXED_ZEROS, RELAXED_FRONTAL)
     for c in priors:
         n_separator = np.int64(tb.cliques(head)[c].n_separator)
         need_f += pools.rounded(pools.n_values(0, n_separator))
@@ -170,13 +170,12 @@ def analyse(head):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def in_postorder(  # type: ignore[no-untyped-def]
-    order, eliminated, n_before, most_zeros, most_frontal, sorts,
+    order, eliminated, n_before, most_zeros, most_frontal,
 ):
     """
     Return the cliques found by `minimum_degree`, amalgamated and in postorder.
 
-    Its node k is `order[k]`; the first `n_before` are not in a clique with others. If asked for it
-    sorts separators, which pays where the same cliques are eliminated several times.
+    Its node k is `order[k]`; the first `n_before` are not in a clique with others.
     """
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
     n_apart = 0
@@ -236,7 +235,7 @@ def in_postorder(  # type: ignore[no-untyped-def]
         q = raw_order[k]
         for m in range(offset[q] + raw_frontal[q], offset[q + 1]):  # they are nearly sorted
             v, i = raw_nodes[m], filled[k]
-            while (sorts and i > first[k] + n_frontal[k]
+            while (i > first[k] + n_frontal[k]
                     and eliminated_at[nodes[i - 1]] > eliminated_at[v]):
                 nodes[i] = nodes[i - 1]
                 i -= 1

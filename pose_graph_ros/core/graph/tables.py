@@ -206,7 +206,7 @@ FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 
 # Capacity of a new table [rows]; rows never written to take no memory.
-FIRST_ROWS: Final = 1024
+FIRST_ROWS: Final = 4096
 
 IntHead = npt.NDArray[np.int64]
 

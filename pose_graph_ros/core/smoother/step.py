@@ -58,7 +58,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     settled = True
     while True:
         # in the first iteration, the constraints that the last update has left over
-        _relinearize(head)
+        relinearize(head)
         if head[tb.N_TOUCHED] == 0:
             break
         # all cliques from the touched nodes up to the roots are eliminated again
@@ -66,9 +66,11 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         head[tb.ITERATION] += 1
         head[tb.SINCE] = head[tb.ITERATION]
         if head[tb.STRUCTURE] != 0:
-            code = tree_update.rebuild(head, marked, affected)
+            code, rows = tree_update.reordered(head, marked, affected)
         else:
-            code = tree_update.refresh(head, marked)
+            code, rows = tree_update.renewed(head, marked)
+        if code == tree_update.DONE:
+            code = tree_update.eliminate(head, rows)
         if code != tree_update.DONE:
             return code
         head[tb.STRUCTURE] = 0
@@ -77,7 +79,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         error2 = _solve_and_check(head)
         if tree_update.interrupted(head):
             return tree_update.INTERRUPTED
-        settled = error2 <= _budget(head)
+        settled = error2 <= budget(head)
         if settled:
             _forget_waiting(head)
             break
@@ -117,7 +119,9 @@ def _iterate(head):  # type: ignore[no-untyped-def]
         return tree_update.DONE      # many errors, each of them negligible
     marked, affected = tree_update.mark(head)
     head[tb.ITERATION] += 1
-    code = tree_update.refresh(head, marked)
+    code, rows = tree_update.renewed(head, marked)
+    if code == tree_update.DONE:
+        code = tree_update.eliminate(head, rows)
     if code != tree_update.DONE:
         return code
     forget_touched(head)
@@ -183,13 +187,13 @@ def _forget_waiting(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _relinearize(head):  # type: ignore[no-untyped-def]
+def relinearize(head):  # type: ignore[no-untyped-def]
     """
     Linearize the worst waiting factors again, until 0.1 of the budget remains.
 
     The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
-    allowed = 0.1 * _budget(head)
+    allowed = 0.1 * budget(head)
     waiting, cliques = tb.waiting(head), tb.cliques(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
     bins = tb.work_f(head)[:64]
@@ -245,7 +249,7 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _budget(head):  # type: ignore[no-untyped-def]
+def budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
     return min(scalars.budget, scalars.share * scalars.n_moved)
@@ -253,14 +257,20 @@ def _budget(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def _solve_and_check(head):  # type: ignore[no-untyped-def]
+    """Solve from the roots on the stack down; return the sum that `check` does."""
+    back_substitute(head)
+    return check(head)
+
+
+@kernel
+def check(head):  # type: ignore[no-untyped-def]
     """
-    Solve from the roots on the stack down; return the sum of the squared linearization errors.
+    Return the sum of the squared linearization errors after a solve.
 
     They are those of the factors of all nodes that the solve lists, each factor once, and of the
     listed turned frames. Factors with large errors wait to be linearized again, and frames with
     large errors stay listed.
     """
-    back_substitute(head)
     scalars, cliques, waiting = tb.scalars(head)[0], tb.cliques(head), tb.waiting(head)
     work_i, iteration = tb.work_i(head), head[tb.ITERATION]
     checks, turned = work_i[head[tb.NODE_ROOM]:], work_i[2 * head[tb.NODE_ROOM]:]

@@ -94,12 +94,12 @@ def mark(head):  # type: ignore[no-untyped-def]
     return marked[:n_marked], affected[:n_affected]
 
 
-@kernel(allocates=True, inline='always')    # callees compile once
-def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
+@kernel(allocates=True)
+def reordered(head, marked, affected):  # type: ignore[no-untyped-def]
     """
-    Replace the marked cliques: their nodes are ordered and eliminated anew.
+    Return a code and the cliques, without values, that replace the marked ones.
 
-    The new roots are put on the stack for the back-substitution.
+    They are those of a new order of the affected nodes, children first.
     """
     nodes, tree = tb.nodes(head), tb.cliques(head)
     n_leaving = 0   # the nodes that are about to leave come first
@@ -116,10 +116,10 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     orphans, start, adjacency = structure(head, marked, loose[:n_loose], affected)
     cliques = in_postorder(
         affected, minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency),
-        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, True)
+        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL)
     if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
                     head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
-        return MORE_MEMORY
+        return MORE_MEMORY, marked
     # to each orphan goes the drift of all cliques above it, which are about to be dropped
     drifting = False
     for k in range(len(marked)):
@@ -134,12 +134,33 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             tree[orphans[k]].drift += drift
     for k in range(len(marked)):
         transaction_log.drop_clique(head, marked[k])
-    head[tb.N_ROOTS] = 0
-    for c in plant(head, cliques, orphans):
-        code = _eliminate(head, c)
-        if code != DONE:
-            return code
-    return DONE
+    return DONE, plant(head, cliques, orphans)
+
+
+@kernel(allocates=True)
+def renewed(head, marked):  # type: ignore[no-untyped-def]
+    """Return a code and the marked cliques, with memory for new values, children first."""
+    cliques, need, largest = tb.cliques(head), np.int64(0), np.int64(0)
+    for k in range(len(marked)):
+        row = cliques[marked[k]]
+        largest = max(largest, work_size(row.n_frontal + row.n_separator))
+        if row.values_born != head[tb.UPDATE]:
+            need += pools.rounded(pools.n_values(row.n_frontal, row.n_separator))
+    if lacks_memory(head, head[tb.POOL_F_END] + need, 0, largest):
+        return MORE_MEMORY, marked
+    # each path that was marked, from the bottom up, ends below an earlier one
+    rows, end, n = np.empty(len(marked), np.int32), len(marked), 0
+    while end > 0:
+        begin = end - 1
+        while begin > 0 and cliques[marked[begin - 1]].parent == marked[begin]:
+            begin -= 1
+        for k in range(begin, end):
+            transaction_log.renew_values(head, marked[k])
+            cliques[marked[k]].built = head[tb.ITERATION]
+            rows[n] = marked[k]
+            n += 1
+        end = begin
+    return DONE, rows
 
 
 @kernel
@@ -150,43 +171,16 @@ def interrupted(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _eliminate(head, c):  # type: ignore[no-untyped-def]
-    """Eliminate a clique, and put it on the stack if it is a root; return a code."""
-    if interrupted(head):
-        return INTERRUPTED
-    head[tb.BAD_NODE] = eliminate_clique(head, c, RELINEARIZED)
-    if tb.cliques(head)[c].parent < 0:
-        tb.work_i(head)[head[tb.N_ROOTS]] = c
-        head[tb.N_ROOTS] += 1
-    return DONE if head[tb.BAD_NODE] < 0 else BAD_PIVOT
-
-
-@kernel(inline='always')
-def refresh(head, marked):  # type: ignore[no-untyped-def]
-    """
-    Eliminate the marked cliques again with the same structure.
-
-    Their roots are put on the stack for the back-substitution.
-    """
-    cliques, need, largest = tb.cliques(head), np.int64(0), np.int64(0)
-    for k in range(len(marked)):
-        row = cliques[marked[k]]
-        largest = max(largest, work_size(row.n_frontal + row.n_separator))
-        if row.values_born != head[tb.UPDATE]:
-            need += pools.rounded(pools.n_values(row.n_frontal, row.n_separator))
-    if lacks_memory(head, head[tb.POOL_F_END] + need, 0, largest):
-        return MORE_MEMORY
-    # children first: each path that was marked, from the bottom up, ends below an earlier one
-    end, head[tb.N_ROOTS] = len(marked), 0
-    while end > 0:
-        begin = end - 1
-        while begin > 0 and cliques[marked[begin - 1]].parent == marked[begin]:
-            begin -= 1
-        for k in range(begin, end):
-            transaction_log.renew_values(head, marked[k])
-            code = _eliminate(head, marked[k])
-            if code != DONE:
-                return code
-            cliques[marked[k]].built = head[tb.ITERATION]
-        end = begin
+def eliminate(head, rows):  # type: ignore[no-untyped-def]
+    """Eliminate cliques, put the roots on the stack of the back-substitution; return a code."""
+    head[tb.N_ROOTS] = 0
+    for c in rows:
+        if interrupted(head):
+            return INTERRUPTED
+        head[tb.BAD_NODE] = eliminate_clique(head, c, RELINEARIZED)
+        if head[tb.BAD_NODE] >= 0:
+            return BAD_PIVOT
+        if tb.cliques(head)[c].parent < 0:
+            tb.work_i(head)[head[tb.N_ROOTS]] = c
+            head[tb.N_ROOTS] += 1
     return DONE
