@@ -514,7 +514,7 @@ def state(graph: Graph) -> dict[str, bytes]:
         for row, c in cliques(graph).items())
     parts['priors'] = b''.join(
         prior.nodes.tobytes() + packed(prior).tobytes() for prior in graph.priors)
-    parts['newest'] = memory.head[tb.NEWEST].tobytes()
+    parts['newest'] = memory.head[tb.NEWEST:tb.FIXED + 1].tobytes()
     parts['next'] = memory.head[tb.NEXT_NODE:tb.N_LEAVING + 1].tobytes()
     parts['structure'] = bytes([int(memory.head[tb.STRUCTURE]) != 0])
     return parts

@@ -15,6 +15,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -149,6 +150,12 @@ class Edits(RuleBasedStateMachine):
         assert self.smoother.chi2() == pytest.approx(optimum.chi2(), rel=1e-9, abs=1e-9)
 
     @invariant()
+    def knows_a_fixed_node(self) -> None:
+        graph = self.smoother.graph
+        row = graph.memory.head[tb.FIXED]
+        assert graph.fixed[row] if row >= 0 else not np.any(graph.fixed)
+
+    @invariant()
     def has_the_covariances_of_its_linearization(self) -> None:
         graph = self.smoother.graph
         if graph.n_nodes == 0:
@@ -222,6 +229,29 @@ def test_a_node_may_turn_by_many_turns(step: float) -> None:
         assert np.max(np.abs(slow.step())) < CLOSE
         assert se2.wrap(smoother.poses[0, 2] - k * step) == pytest.approx(0.0, abs=1e-6)
         assert smoother.chi2() < 1e-9
+
+
+def test_a_map_turns_about_its_fixed_pose_without_new_linearizations() -> None:
+    rng, stiff, weak = np.random.default_rng(0), np.diag((20.0, 20.0, 50.0))**2, np.diag(
+        (20.0, 20.0, 2.0))**2
+    smoother, at, quarter, seen = IncrementalSmoother(), np.zeros(2), 0, dict[bytes, int]()
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=(0,)))
+    truth = [np.zeros(3)]
+    for k in range(1, 400):     # a walk in a grid, whose first edge knows little of the heading
+        quarter += int(rng.integers(-1, 2))
+        ahead = np.array((np.cos(quarter * np.pi / 2), np.sin(quarter * np.pi / 2)))
+        at = np.clip(at + np.round(ahead), -6, 6)
+        truth.append(np.array((*2.0 * at, quarter * np.pi / 2)))
+        smoother.extend(se2.between(truth[-2], truth[-1]), weak if k == 1 else stiff)
+        before = seen.setdefault(at.tobytes(), k)
+        if before < k - 5:
+            mean = se2.between(truth[before], truth[k]) + rng.normal(size=3) * 0.01
+            smoother.update(GraphUpdate(factors=link(before, k, mean, stiff)))
+    turned = se2.compose(np.array((0.0, 0.0, 0.2)), truth[-1])
+    result = smoother.update(GraphUpdate(factors=link(0, 399, turned, stiff)))
+    assert abs(smoother.poses[1, 2] - truth[1][2]) > 0.1
+    assert result.status is Status.CONVERGED
+    assert result.relinearized < 100    # of 700; if the fixed pose is eliminated first, 450
 
 
 # --- failure ------------------------------------------------------------------------------------
