@@ -11,7 +11,7 @@ else to do after an update, the thread refines the estimate, and then waits.
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import logging
 import threading
 import time
@@ -44,7 +44,7 @@ Job = Callable[[PoseGraphBackend], Result]
 
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
-GATHERING = 0.05
+GATHERING = 0.1
 MOST_JOBS = 100  # of a kind that wait; the oldest is dropped
 
 
@@ -96,7 +96,9 @@ class Worker:
         self._n_dropped = 0  # number of jobs that were too many
         self._stopping = False
         self.watchdog = Watchdog()
-        self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
+        self._may_refine = False
+        # since the last estimate: the distance that nodes have moved [m], and measurements added
+        self._refined, self._n_added = 0.0, 0
         self._condition = threading.Condition()
         self._revision = backend.revision
         self.durations = 0, 0.0, 0.0  # number, sum and longest of updates with a solve [s]
@@ -258,9 +260,12 @@ class Worker:
             self._note('update')
             with self.watchdog.over(self._backend, 'an update'):
                 report = self._update(self._backend.update)
+        self._n_added += len(batch)
         # after a jump of the odometry the old estimate cannot be propagated
         stale = self._revision != self._backend.revision
-        if report is not None or self.estimate is None or stale:
+        # an update to which nothing has come since the last estimate makes the same one
+        if self.estimate is None or stale or (report is not None and (
+                self._n_added + report.new_constraints + report.iterations > 0)):
             self._publish()
         self._report(report, len(batch))
         self._may_refine = self._may_refine or report is not None
@@ -338,7 +343,7 @@ class Worker:
         return report
 
     def _publish(self) -> None:
-        self._revision, self._refined = self._backend.revision, 0.0
+        self._revision, self._refined, self._n_added = self._backend.revision, 0.0, 0
         self.estimate = self._backend.estimate(with_path=False)
         if self.estimate is not None and not self._stopping:
             self._on_estimate(self._backend)
@@ -354,19 +359,23 @@ class Worker:
             if stream.n_jumps > self._jumps[source]:
                 logger.warning('%s jumped %s: its motion there is not used', source, stream.jump)
             self._jumps[source] = stream.n_jumps
-        changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
+        changes, verdicts = backend.verdict_changes(), status.verdicts
+        if report is not None or len(changes) > 0:
+            # all else changes nothing of these
+            verdicts = backend.verdict_totals()
+            status = replace(
+                status, quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
+                verdicts=verdicts, biases=backend.gyro_biases(backend.graph),
+                calibrations=backend.calibrations(), differences=backend.gyro_differences())
         doubted = {source for source, each in verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
         counts = backend.counts + Counter({('worker', 'dropped_job'): self._n_dropped})
-        self.status = WorkerStatus(
-            processed=status.processed + processed, counts=counts,
+        self.status = replace(
+            status, processed=status.processed + processed, counts=counts,
             refusals=dict(backend.refusals), pending=backend.n_waiting,
-            quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
-            biases=backend.gyro_biases(backend.graph), calibrations=backend.calibrations(),
-            differences=backend.gyro_differences(), verdicts=verdicts,
             n_changes=status.n_changes + len(changes))
         return len(changes)
 
