@@ -13,6 +13,7 @@ in use.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 import math
 
 import numpy as np
@@ -36,6 +37,7 @@ from pose_graph_ros.core.transaction import succeeds
 
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
+_is_close = partial(math.isclose, rel_tol=1e-9, abs_tol=1e-12)
 # Slow errors that differ by less than this factor are not changed online in the graph.
 ALIKE = 1.5
 
@@ -196,7 +198,7 @@ class ErrorTuner:
         elif self._nodes.n_primaries > 1 or calibrated:
             wanted = OdometryErrors(wanted.way, wanted.turn)
         # but for rounding, however well they are known
-        known = np.allclose(wanted[:4], self._nodes.errors[:4], rtol=1e-9, atol=1e-12)
+        known = all(map(_is_close, wanted[:4], self._nodes.errors[:4]))
         return None if known or wanted == self._failed else wanted
 
     def _correct_odometry(self, wanted: OdometryErrors) -> None:

@@ -127,7 +127,7 @@ class ClosureJudge:
 
     def _part(self) -> bool:
         """Throw out what does not fit, or test some that wait; tell whether there was any."""
-        if self._smoother.graph.has_touched:
+        if self._smoother.graph.has_touched or len(self.states) == 0:
             return False
         return self._throw_out(np.flatnonzero(self.states.in_graph)) or self.test()
 
