@@ -11,6 +11,7 @@ better one. What takes long to load, such as compiled kernels, is imported where
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 import json
 from pathlib import Path
 import re
@@ -226,6 +227,15 @@ def _report(made: Certificate | None, reason: str, seconds: float, chi2: float, 
                     f'{max(chi2 - bound, 0.0):.2g} above this']
 
 
+def _hessian(problem: Problem, solution: Solution) -> NearHessian:
+    """Return what the solver has left of the Hessian at the minimum."""
+    if solution.optimizer is not None:
+        return NearHessian(solution.optimizer.nodes.places, solution.optimizer.heading_steps)
+    from pose_graph_ros.core.batch import gauss_newton
+
+    return NearHessian(None, partial(gauss_newton.heading_steps, problem.engine.memory))
+
+
 def with_certificate(problem: Problem, solution: Solution, *,
                      eigenvalue: bool) -> tuple[Solution, Report]:
     """Return the certificate of a solution, and a better solution if it leads to one."""
@@ -239,9 +249,9 @@ def with_certificate(problem: Problem, solution: Solution, *,
     if solution.result.status is Status.FAILED:
         return none(f'the optimisation failed: {solution.result.reason}')
     try:
-        formulation, by = formulate(graph), solution.optimizer
-        made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
-            None if by is None else NearHessian(by.nodes.places, by.heading_steps)))
+        formulation = formulate(graph)
+        made = certify(formulation, graph.poses, eigenvalue=eigenvalue,
+                       hessian=_hessian(problem, solution))
     except (NotCoveredError, LinearSolveError) as error:
         return none(str(error))
     found = None

@@ -114,7 +114,8 @@ class Spectrum(NamedTuple):
 class NearHessian(NamedTuple):
     """What an optimiser that has moved the poses to a minimum of chi2 knows of it."""
 
-    places: IntArray  # of the F hidden nodes that are not fixed, in its order of elimination
+    # of the F hidden nodes that are not fixed, in its order of elimination, if it tells
+    places: IntArray | None
     # from derivatives of chi2 by the headings of these, (F,), to their part of a Gauss-Newton step
     solve: Callable[[FloatArray], FloatArray]
 
@@ -133,8 +134,9 @@ def certify(formulation: Formulation, poses: Poses, *, eigenvalue: bool = True,
     Raises LinearSolveError if the objective does not determine the positions or headings.
     """
     # the map is the last that is eliminated
-    form = QuadraticForm(formulation, None if hessian is None else np.concatenate(
-        ([len(hessian.places)], hessian.places)))
+    places = None if hessian is None else hessian.places
+    form = QuadraticForm(formulation, None if places is None else np.concatenate(
+        ([len(places)], places)))
     if form.n == 1:
         cost = form.cost(np.ones((1, 1), dtype=np.complex128))
         return Certificate(Verdict.CERTIFIED, cost, cost, 0.0, None, 1, poses.copy())
@@ -190,8 +192,10 @@ def examined(form: QuadraticForm, y: ComplexArray, *, eigenvalue: bool = True) -
     `eigenvalue` asks for the smallest one also if there is a proof without it. Raises
     LinearSolveError if rounding leaves no matrix positive definite that has to be.
     """
-    diagonal = multipliers(y, form.product(y))
-    total = float(np.sum(diagonal))
+    diagonal, total = multipliers(y, form.product(y)), form.cost(y)
+    # the trace is f but for rounding, which that of the best positions acts on in first order, on
+    # f in second; any diagonal proves a bound
+    diagonal += (total - np.sum(diagonal)) / form.n
     # the first against rounding in the factors
     shift = 1e-15 * form.diagonal + TUNING.shift * (abs(total) + 1.0) / form.n
     factors = _definite(form, shift - diagonal)

@@ -20,7 +20,7 @@ from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination import assembly
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
+from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
 
@@ -170,6 +170,17 @@ class CompiledSystem:
             return math.inf, 0.0
         length = float(step(self._head, np.zeros_like(self._right), False))
         return length, float(np.sum(self._right * self._rows['delta']))
+
+
+def heading_steps(memory: tb.Memory, derivative: FloatArray) -> FloatArray:
+    """Return a chord step of the headings of nodes that are not fixed, (F,); nothing moves."""
+    rows = memory['nodes'][:memory.head[tb.N_NODES]]
+    free, kept = rows['fixed'] == 0, rows[['pose', 'delta']].copy()
+    right = np.zeros((len(rows), 3))
+    right[free, 2] = derivative
+    step(memory.head, right, True)
+    rows[['pose', 'delta']] = kept
+    return right[free, 2]
 
 
 def solve_chordal(memory: tb.Memory, known: ComplexArray,
