@@ -19,15 +19,12 @@ import threading
 from types import FrameType
 
 from pose_graph_ros import __version__
-from pose_graph_ros.cli import arguments, fleet_options, simulation_options
 from pose_graph_ros.core.exceptions import PoseGraphError
 
-TOOLS = {declare.__name__.replace('_', '-'): declare for declare in (
-    arguments.demo, arguments.replay, arguments.solve, arguments.report, arguments.draw,
-    arguments.marginalize, arguments.tune, fleet_options.fleet, arguments.migrate,
-    simulation_options.simulate,
-    arguments.parameters, arguments.compile_kernels)}
-"""Tools and what adds their arguments, whose docstrings say what they do."""
+TOOLS = {name: {'fleet': 'fleet_options', 'simulate': 'simulation_options'}.get(name, 'arguments')
+         for name in ('demo', 'replay', 'solve', 'report', 'draw', 'marginalize', 'tune', 'fleet',
+                      'migrate', 'simulate', 'parameters', 'compile-kernels')}
+"""Modules with the function that adds the arguments of a tool; its docstring says what it does."""
 RETRY = 0.01  # after which an interrupt is tried again [s]
 
 
@@ -36,8 +33,14 @@ def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog='pose-graph', description='Tools around the pose graph node.')
     parser.add_argument('--version', action='version', version=__version__)
-    tools = parser.add_subparsers(title='tools', required=True, dest='tool')
-    for name, declare in TOOLS.items():
+    words = sys.argv[1:] if args is None else args
+    # of the others not even the arguments are loaded, which takes as long as a small graph
+    named = words[:1] if len(words) > 0 and words[0] in TOOLS else [*TOOLS]
+    tools = parser.add_subparsers(title='tools', required=True, dest='tool', metavar=(
+        None if len(named) > 1 else f'{{{",".join(TOOLS)}}}'))
+    for name in named:
+        module = importlib.import_module(f'pose_graph_ros.cli.{TOOLS[name]}')
+        declare = getattr(module, name.replace('-', '_'))
         # the description, the arguments and, behind these, the examples
         text, examples, rest = inspect.cleandoc(declare.__doc__ or '').partition('examples:')
         summary = text.partition('\n')[0].removesuffix('.')
@@ -46,7 +49,7 @@ def main(args: list[str] | None = None) -> int:
             formatter_class=argparse.RawDescriptionHelpFormatter))
 
     def run() -> int:
-        options = parser.parse_args(args)
+        options = parser.parse_args(words)
         module = importlib.import_module(f'pose_graph_ros.cli.{options.tool.replace("-", "_")}')
         return int(module.execute(options))
     return guarded(run)

@@ -375,7 +375,7 @@ def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]
         factors.kind], np.where(moved, 'OBSERVED_SE2_OFFSET', np.where(
             placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2')))
     lines = np.empty(len(factors), dtype=object)
-    for tag in np.unique(tags).tolist():
+    for tag in sorted(set(tags.tolist())):
         layout, chosen = gt.TAGS[tag], np.flatnonzero(tags == tag)
         some = factors.rows(chosen)
         row, column = np.triu_indices(layout.rows)
