@@ -128,7 +128,7 @@ def write_rows(front, n, ld, pool_f, at):  # type: ignore[no-untyped-def]
         pool_f[at - 1] = front[(k + 1) * ld - 1]
 
 
-@kernel(fastmath=_FAST)
+@kernel
 def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
     Solve `R^T y = x` for the frontal rows of a clique, and subtract them from the separator's.
@@ -136,14 +136,20 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     The values are the first rows of a triangle of n columns, laid out by `pools.row_start`.
     """
     for k in range(0, rows, 3):
-        r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
-                      values[row_start(k + 2, n):])
-        a = x[k] * r0[k]
-        b = (x[k + 1] - r0[k + 1] * a) * r1[k + 1]
-        c = (x[k + 2] - r0[k + 2] * a - r1[k + 2] * b) * r2[k + 2]
+        # where column 0 of each row would be
+        p, q, r = row_start(k, n), row_start(k + 1, n), row_start(k + 2, n)
+        a = x[k] * values[p + k]
+        b = (x[k + 1] - values[p + k + 1] * a) * values[q + k + 1]
+        c = (x[k + 2] - values[p + k + 2] * a - values[q + k + 2] * b) * values[r + k + 2]
         x[k], x[k + 1], x[k + 2] = a, b, c
-        for m in range(k + 3, n):
-            x[m] -= a * r0[m] + b * r1[m] + c * r2[m]
+        va, vb, vc, m = spread(a), spread(b), spread(c), k + 3
+        while m + WIDTH <= n:
+            y = fnmadd(fnmadd(load(x, m), va, load(values, p + m)), vb, load(values, q + m))
+            store(x, m, fnmadd(y, vc, load(values, r + m)))
+            m += WIDTH
+        while m < n:
+            x[m] -= a * values[p + m] + b * values[q + m] + c * values[r + m]
+            m += 1
 
 
 @kernel(fastmath=_FAST)
