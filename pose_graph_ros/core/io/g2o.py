@@ -348,9 +348,8 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
                      f'{np.sum(~is_edge & ~written)} observed biases')
     is_landmark = ~rows.is_pose & ~rows.is_bias
     for tag, chosen in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
-        numbers = _texts(rows.poses[chosen, :gt.TAGS[tag].rows])
-        lines += [f'{tag} {name} {text}' for name, text in zip(
-            ids[chosen].tolist(), numbers, strict=True)]
+        lines += _texts([tag] * int(np.sum(chosen)), ids[chosen, None],
+                        rows.poses[chosen, :gt.TAGS[tag].rows])
     lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
     lines += _factor_lines(factors.rows(written), ids, used[written])
     if np.any(calibrated):
@@ -379,18 +378,20 @@ def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]
         layout, chosen = gt.TAGS[tag], np.flatnonzero(tags == tag)
         some = factors.rows(chosen)
         row, column = np.triu_indices(layout.rows)
-        numbers = _texts(np.hstack((
+        numbers = np.hstack((
             some.offset[:, :3 * layout.has_offset], some.mean[:, :layout.rows],
-            0.5 * (some.information + np.swapaxes(some.information, 1, 2))[:, row, column])))
-        ends = np.column_stack((ids[some.i], ids[some.j]))[:, :layout.n_ids]
-        lines[chosen] = [
-            f'{"" if is_used else NOT_USED}{tag} {" ".join(map(str, names))} {text}'
-            for is_used, names, text in zip(
-                used[chosen].tolist(), ends.tolist(), numbers, strict=True)]
+            0.5 * (some.information + np.swapaxes(some.information, 1, 2))[:, row, column]))
+        lines[chosen] = _texts(np.where(used[chosen], tag, NOT_USED + tag).tolist(), np.stack(
+            (ids[some.i], ids[some.j])[:layout.n_ids], axis=1), numbers)
     return lines[np.argsort(factors.j < 0, kind='stable')].tolist()
 
 
-def _texts(rows: FloatArray) -> list[str]:
-    """Return the numbers of each row with the digits needed to read them back bit for bit."""
-    # the text of a list is made at once
-    return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]
+def _texts(tags: list[str], ids: IntArray, numbers: FloatArray) -> list[str]:
+    """Return a line for each row, with the digits needed to read numbers back bit for bit."""
+    columns = [map(str, column) for column in ids.T.tolist()]
+    # as integers, which tell 0.0 and -0.0 apart; those of the information are mostly the same
+    for column in np.ascontiguousarray(numbers.T).view(np.int64):
+        each, place = np.unique(column, return_inverse=True)
+        texts = [*map(repr, each.view(np.float64).tolist())]
+        columns.append(map(texts.__getitem__, place.tolist()))
+    return [*map(' '.join, zip(tags, *columns, strict=True))]

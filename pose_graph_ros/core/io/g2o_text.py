@@ -7,11 +7,12 @@ All lines of a tag are converted together. Only if that fails are they checked o
 number of the first line that is wrong and the reason.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
+import warnings
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +57,7 @@ TAGS = {
 }
 MEASURED = [tag for tag, layout in TAGS.items() if layout.has_information]
 _SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
+_BLOCK = 1 << 20    # characters of a text whose lines are objects at a time
 _GZIP = b'\x1f\x8b'
 
 
@@ -95,60 +97,90 @@ def read_text(path: Path) -> str:
 
 def lines_of(path: Path, text: str) -> GraphText:
     """Return what is in the text of a file; FileFormatError with the line if one is malformed."""
-    # of each line the words, and its number behind them
-    found: dict[str, list[list[Any]]] = {tag: [] for tag in TAGS}
+    tables: dict[str, list[Lines]] = {tag: [_lines([], [], tag)] for tag in TAGS}
     skipped: dict[str, list[list[str]]] = {}
-    for line, content in enumerate(text.splitlines(), 1):
-        words = content.split()
-        if len(words) == 0 or words[0][0] == '#':
-            continue
-        tag = words[0]
-        if tag == 'EDGE_SE2_SWITCHABLE':
-            tag, words = 'EDGE_SE2', ['EDGE_SE2', *words[1:3], *words[4:]]
-        if tag in found:
-            found[tag] += ([[*words, line]] if tag != 'FIX' else
-                           [[tag, word, line] for word in words[1:]])
-        elif tag not in _SWITCHES:
-            skipped.setdefault(tag, []).append([str(line), *words[1:2]])
+    first = 1
+    for block in _blocks(text):
+        # of each line the text, and its number
+        found: dict[str, tuple[list[str], list[int]]] = {tag: ([], []) for tag in TAGS}
+        contents = block.splitlines()
+        for line, content in enumerate(contents, first):
+            words = content.split(None, 1)
+            tag = words[0] if len(words) > 0 else '#'
+            if tag in found and tag != 'FIX':
+                found[tag][0].append(content)
+                found[tag][1].append(line)
+            elif tag[0] == '#':
+                pass
+            elif tag == 'FIX':
+                names = words[1].split() if len(words) > 1 else []
+                found[tag][0].extend(f'FIX {name}' for name in names)
+                found[tag][1].extend([line] * len(names))
+            elif tag == 'EDGE_SE2_SWITCHABLE':
+                words = content.split()
+                found['EDGE_SE2'][0].append(' '.join(['EDGE_SE2', *words[1:3], *words[4:]]))
+                found['EDGE_SE2'][1].append(line)
+            elif tag not in _SWITCHES:
+                skipped.setdefault(tag, []).append([str(line), *content.split(None, 2)[1:2]])
+        first += len(contents)
+        try:
+            for tag, each in found.items():
+                tables[tag].append(_lines(*each, tag))
+        except (ValueError, OverflowError):
+            _raise_first(path, found)
+    rows = {tag: np.concatenate(tables.pop(tag)) for tag in TAGS}
     # without those of vertices that were skipped
-    names = {words[1] for tag, some in skipped.items() if tag.startswith('VERTEX')
-             for words in some if len(words) > 1}
-    found['FIX'] = [words for words in found['FIX'] if words[1] not in names]
-    if not any(some for tag, some in found.items() if tag != 'FIX'):
+    gone = {words[1] for tag, some in skipped.items() if tag.startswith('VERTEX')
+            for words in some if len(words) > 1}
+    rows['FIX'] = rows['FIX'][[str(name) not in gone for name in rows['FIX']['ids'][:, 0]]]
+    if not any(len(some) for tag, some in rows.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
-    try:
-        tables = {tag: _lines(some, TAGS[tag]) for tag, some in found.items()}
-    except (ValueError, OverflowError):
-        _raise_first(path, found)
-    return GraphText(path, tables, {tag: len(each) for tag, each in skipped.items()})
+    return GraphText(path, rows, {tag: len(each) for tag, each in skipped.items()})
 
 
-def _lines(words: list[list[Any]], tag: Tag) -> Lines:
+def _blocks(text: str) -> Iterator[str]:
+    """Yield a text in parts of whole lines, so that not all of them are objects at once."""
+    begin = 0
+    while begin < len(text):
+        end = text.find('\n', begin + _BLOCK) + 1 or len(text)
+        yield text[begin:end]
+        begin = end
+
+
+def _lines(contents: list[str], lines: list[int], tag: str) -> Lines:
     """Return lines as arrays; raise ValueError or OverflowError if one is malformed."""
-    n, n_ids, n_numbers = len(words), tag.n_ids, tag.n_numbers
-    if any(len(each) != 2 + n_ids + n_numbers for each in words):
-        raise ValueError
-    columns = [*zip(*words, strict=True)] if n > 0 else [()] * (2 + n_ids + n_numbers)
+    n, n_ids, n_numbers = len(contents), TAGS[tag].n_ids, TAGS[tag].n_numbers
     table = np.empty(n, [('ids', 'i8', (n_ids,)), ('numbers', 'f8', (n_numbers,)), ('line', 'i8')])
-    table['ids'] = np.array([[*map(int, column)] for column in columns[1:1 + n_ids]], np.int64).T
-    table['numbers'] = np.fromiter(map(float, chain.from_iterable(columns[1 + n_ids:-1])),
-                                   np.float64, n * n_numbers).reshape(n_numbers, n).T
-    table['line'] = columns[-1]
-    if not np.all(np.isfinite(table['numbers'])):
+    columns = [*zip(*(each.split(None, 1 + n_ids) for each in contents), strict=True)]
+    if n > 0 and len(columns) != 1 + n_ids + (n_numbers > 0):
         raise ValueError
+    for k, column in enumerate(columns[1:1 + n_ids]):
+        table['ids'][:, k] = [*map(int, column)]
+    if n > 0 and n_numbers > 0:
+        # numbers of all lines at once, with what no number is behind each line
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            numbers = np.fromstring(' nan '.join([*columns[-1], '']), sep=' ')
+        numbers = numbers.reshape(n, n_numbers + 1)
+        if not np.all(np.isfinite(numbers) == (np.arange(n_numbers + 1) < n_numbers)):
+            raise ValueError
+        table['numbers'] = numbers[:, :-1]
+    table['line'] = lines
     return table
 
 
-def _raise_first(path: Path, found: dict[str, list[list[Any]]]) -> NoReturn:
+def _raise_first(path: Path, found: dict[str, tuple[list[str], list[int]]]) -> NoReturn:
     """Raise FileFormatError for the first line that is malformed."""
-    for words in sorted(chain.from_iterable(found.values()), key=itemgetter(-1)):
-        tag = TAGS[words[0]]
+    lines = [(line, tag, content) for tag, (contents, numbers) in found.items()
+             for line, content in zip(numbers, contents, strict=True)]
+    for line, tag, content in sorted(lines, key=itemgetter(0)):
         try:
-            _lines([words], tag)
+            _lines([content], [line], tag)
         except (ValueError, OverflowError) as error:
+            words = content.split()[1:]
             raise FileFormatError(
-                f'{path}:{words[-1]}: {words[0]} is followed by {tag.n_ids + tag.n_numbers} '
-                f'numbers, got {len(words) - 2}: {" ".join(words[1:-1])}; ids are integers of 64 '
+                f'{path}:{line}: {tag} is followed by {TAGS[tag].n_ids + TAGS[tag].n_numbers} '
+                f'numbers, got {len(words)}: {" ".join(words)}; ids are integers of 64 '
                 'bits, the others finite') from error
     raise AssertionError('no line is malformed')
 
