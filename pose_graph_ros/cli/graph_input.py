@@ -13,6 +13,7 @@ from operator import itemgetter
 from pathlib import Path
 import re
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +22,9 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
-from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
+
+if TYPE_CHECKING:
+    from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 SAVED = b'{\n"sha256": "'  # begin of the .json file of a saved graph
@@ -81,13 +84,18 @@ def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
     return np.flatnonzero(chosen)
 
 
-def read_measurements(path: Path, edge2: str | None = None) -> list[OdometrySample | LoopClosure]:
+def read_measurements(
+    path: Path, edge2: str | None = None,
+) -> 'list[OdometrySample | LoopClosure]':
     """
     Return the measurements in a g2o file, in the order in which they come.
 
     The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Raises
     FileFormatError if a vertex has no edge to the next one.
     """
+    # what only reads a graph need not load them
+    from pose_graph_ros.core.measurements import LoopClosure  # noqa: PLC0415
+
     file = read_file(path, edge2)
     edges, n = file.graph.factors.edges, file.graph.n_nodes
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
@@ -112,8 +120,10 @@ def read_measurements(path: Path, edge2: str | None = None) -> list[OdometrySamp
     return [each for _, each in sorted(events, key=itemgetter(0))]
 
 
-def _odometry(edges: Factors) -> Iterator[OdometrySample]:
+def _odometry(edges: Factors) -> 'Iterator[OdometrySample]':
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
+    from pose_graph_ros.core.measurements import OdometrySample  # noqa: PLC0415
+
     motions = np.where((edges.i < edges.j)[:, None], edges.mean, se2.inverse(edges.mean))
     variances, pose = np.diagonal(_covariances(edges), axis1=1, axis2=2), np.zeros(3)
     for k in range(len(motions) + 1):
