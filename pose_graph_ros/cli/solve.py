@@ -11,7 +11,7 @@ better one. What takes long to load, such as compiled kernels, is imported where
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 import json
 from pathlib import Path
 import re
@@ -84,12 +84,18 @@ class Problem:
     @property
     def graph(self) -> 'Graph | PlainGraph':
         """The graph, with the best poses that were found."""
-        return self._file.graph if self.plain is None else self.plain
+        return self._compiled if self.plain is None else self.plain
+
+    @cached_property
+    def _compiled(self) -> 'Graph':
+        graph = self._file.graph
+        del self._file  # of a large graph the rows are a fifth of all memory
+        return graph
 
     @property
     def engine(self) -> 'Graph':
         """The graph for the compiled kernels, at its present poses; it is used from now on."""
-        graph = self._file.graph
+        graph = self._compiled
         if self.plain is not None:
             graph.set_poses(self.plain.poses)
             self.plain = None
@@ -297,14 +303,16 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     rows = None if which is None else np.arange(len(problem.ids)) if which == 'all' else (
         np.array([problem.engine.newest_pose]) if which == 'newest'
         else rows_of(problem.ids, which, '--marginals'))
+    has_start, edge2 = file.has_start, file.edge2_order
+    del file
     held, graph = problem.held, problem.graph
     before = graph.energies().chi2
     say(f'{graph.n_nodes} hidden nodes, {len(graph.factors.edges)} edges, '
         f'{len(graph.factors.observed)} observed nodes; chi2 {before:.9g} as read')
-    if not file.has_start:
+    if not has_start:
         say('nodes without a pose in the file start at poses composed from the edges')
     if len(held) > 0:
-        names = ', '.join(map(str, file.ids[held[:N_LARGEST]].tolist()))
+        names = ', '.join(map(str, problem.ids[held[:N_LARGEST]].tolist()))
         say(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
             f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
     poses = graph.poses.copy()
@@ -334,9 +342,9 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             'reason': result.reason, 'start': solution.start, 'starts': [
                 {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
                  'status': each.status.value} for name, each in solution.tried],
-            'held': file.ids[held].tolist(),
+            'held': problem.ids[held].tolist(),
             'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
-            'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
+            'chi2_start': before, 'seconds': seconds, 'edge2': edge2,
             'robust': decision, 'certificate': certificate,
             **({} if rows is None else {'marginals_relative_error': error}),
             **({} if rows is None or len(tables) > 0 else {'marginals': table})}),

@@ -44,6 +44,7 @@ are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge
 connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -77,6 +78,7 @@ NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
 STANDING_FOR = '# instead of '
 """Begin of lines behind which is nothing but what stands for that which g2o does not have."""
+_BLOCK = 1 << 14    # lines that are made at once
 
 
 @dataclass
@@ -319,7 +321,8 @@ def write_g2o(graph: 'Graph | PlainGraph', path: Path, ids: IntArray | None = No
 
     `ids` are numbers of the hidden nodes, by default their ids.
     """
-    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
+    with path.open('w', encoding='ascii') as file:
+        file.writelines(_parts(graph.rows(), ids))
 
 
 def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
@@ -329,9 +332,14 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     Edges and observed nodes that tell about the same as calibrated odometry and dense priors are
     the last lines. `ids` are numbers of the hidden nodes, by default their ids.
     """
+    return ''.join(_parts(rows, ids))
+
+
+def _parts(rows: GraphRows, ids: IntArray | None) -> Iterator[str]:
+    """Yield the text in parts, so that not all of its lines are objects at once."""
     ids = rows.node_ids if ids is None else ids
     factors = rows.factors.renumbered(rows.rows_of)
-    used, lines = factors.weight > 0.0, list[str]()
+    used = factors.weight > 0.0
     # a measurement with a correlated error has weight 0; an edge from its node to a bias holds it
     to_bias = factors.rows((factors.kind == FactorKind.BIAS) & used)
     held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
@@ -344,29 +352,36 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     calibrated = (factors.kind == FactorKind.ODOMETRY) & (factors.k >= 0)
     n_edges = np.sum(is_edge & ~written & ~calibrated)
     if n_edges > 0 or n_biases > 0:
-        lines.append(f'# left out: {n_biases} biases, {n_edges} edges that g2o does not have and '
-                     f'{np.sum(~is_edge & ~written)} observed biases')
+        yield (f'# left out: {n_biases} biases, {n_edges} edges that g2o does not have and '
+               f'{np.sum(~is_edge & ~written)} observed biases\n')
     is_landmark = ~rows.is_pose & ~rows.is_bias
-    for tag, chosen in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
-        lines += _texts([tag] * int(np.sum(chosen)), ids[chosen, None],
-                        rows.poses[chosen, :gt.TAGS[tag].rows])
-    lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
-    lines += _factor_lines(factors.rows(written), ids, used[written])
+    for tag, is_written in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
+        for some in _blocks(np.flatnonzero(is_written)):
+            yield ''.join(_lines([tag] * len(some), ids[some, None],
+                                 rows.poses[some, :gt.TAGS[tag].rows]))
+    yield ''.join(f'FIX {name}\n' for name in ids[rows.fixed & ~rows.is_bias].tolist())
+    for edges in (is_edge, ~is_edge):
+        for some in _blocks(np.flatnonzero(written & edges)):
+            yield _factor_lines(factors.rows(some), ids, used[some])
     if np.any(calibrated):
         instead = as_calibrated(factors.rows(calibrated), rows.poses)
-        lines += [f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
-                  f'lines', *_factor_lines(instead, ids, used[calibrated])]
+        yield (f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
+               f'lines\n')
+        yield _factor_lines(instead, ids, used[calibrated])
     if len(rows.priors) > 0:
         # takes long to load, and most graphs have none
         from pose_graph_ros.core.marginalization.marginalize import standing_for  # noqa: PLC0415
         instead = standing_for(rows).renumbered(rows.rows_of)
-        lines += [f'{STANDING_FOR}dense priors, which g2o does not have, of which there are '
-                  f'{len(rows.priors)}: {len(instead)} lines',
-                  *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
-    return '\n'.join(lines) + '\n'
+        yield (f'{STANDING_FOR}dense priors, which g2o does not have, of which there are '
+               f'{len(rows.priors)}: {len(instead)} lines\n')
+        yield _factor_lines(instead, ids, np.ones(len(instead), dtype=bool))
 
 
-def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]:
+def _blocks(rows: IntArray) -> list[IntArray]:
+    return np.split(rows, np.arange(_BLOCK, len(rows), _BLOCK))
+
+
+def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> str:
     """Return a line for each factor, those of edges first, given which of them are used."""
     moved = np.any(factors.offset != 0.0, axis=1)
     placed = np.all(factors.information[:, 2] == 0.0, axis=1) & (factors.mean[:, 2] == 0.0)
@@ -381,12 +396,12 @@ def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]
         numbers = np.hstack((
             some.offset[:, :3 * layout.has_offset], some.mean[:, :layout.rows],
             0.5 * (some.information + np.swapaxes(some.information, 1, 2))[:, row, column]))
-        lines[chosen] = _texts(np.where(used[chosen], tag, NOT_USED + tag).tolist(), np.stack(
+        lines[chosen] = _lines(np.where(used[chosen], tag, NOT_USED + tag).tolist(), np.stack(
             (ids[some.i], ids[some.j])[:layout.n_ids], axis=1), numbers)
-    return lines[np.argsort(factors.j < 0, kind='stable')].tolist()
+    return ''.join(lines[np.argsort(factors.j < 0, kind='stable')])
 
 
-def _texts(tags: list[str], ids: IntArray, numbers: FloatArray) -> list[str]:
+def _lines(tags: list[str], ids: IntArray, numbers: FloatArray) -> list[str]:
     """Return a line for each row, with the digits needed to read numbers back bit for bit."""
     columns = [map(str, column) for column in ids.T.tolist()]
     # as integers, which tell 0.0 and -0.0 apart; those of the information are mostly the same
@@ -394,4 +409,4 @@ def _texts(tags: list[str], ids: IntArray, numbers: FloatArray) -> list[str]:
         each, place = np.unique(column, return_inverse=True)
         texts = [*map(repr, each.view(np.float64).tolist())]
         columns.append(map(texts.__getitem__, place.tolist()))
-    return [*map(' '.join, zip(tags, *columns, strict=True))]
+    return [' '.join(words) + '\n' for words in zip(tags, *columns, strict=True)]
