@@ -194,7 +194,7 @@ def sparse_chordal(graph: Constrained, nodes: NodeSystem | None = None) -> Chord
     return solve
 
 
-def chordal(graph: Constrained, solve: ChordalSolve | None = None) -> Poses:
+def chordal(graph: Constrained, solve: ChordalSolve | None = None, least: float = 1e-6) -> Poses:
     """
     Return initial poses from the constraints and the poses of fixed nodes: headings come first.
 
@@ -210,7 +210,7 @@ def chordal(graph: Constrained, solve: ChordalSolve | None = None) -> Poses:
     u = solve(u, None)
     length = np.abs(u)
     # what remains of u where measured headings cancel often leads to another minimum
-    if np.any(length < 1e-6):
+    if np.any(length < least):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
     u /= length
     return _poses(graph, solve(t, u), u)

@@ -33,6 +33,13 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
+# Numbers in the cliques of a graph up to which SuperLU looks for a start: it takes several times
+# their memory, more than 20 GB for a grid of 10^6 poses.
+MOST_VALUES = 100_000_000
+# In larger ones what remains of headings far from the fixed node is used as far as it is not
+# rounding. That of a grid of 10^6 poses, 4e-8, leads to the minimum.
+LEAST_HEADING = 1e-10
+
 __all__ = [
     'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Start', 'Status',
     'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start', 'optimize_from_two_starts',
@@ -145,7 +152,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig) -> BatchResult:
         return result
     poses = before if result.status is Status.FAILED else graph.poses.copy()
     try:
-        graph.set_poses(linear_starts.joint(graph))
+        graph.set_poses(_joint(graph))
         other = optimize(graph, config)
     except LinearSolveError:
         other = result
@@ -164,12 +171,25 @@ def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     graph.memory.check()
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
+        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory),
+                                     *([LEAST_HEADING] if _is_large(graph) else []))
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):
         raise LinearSolveError('joint start: no node is observed')
-    return linear_starts.joint(graph, unit=start is Start.UNIT)
+    return _joint(graph, unit=start is Start.UNIT)
+
+
+def _is_large(graph: Graph) -> bool:
+    """Tell whether the planted cliques of a graph are too large for SuperLU."""
+    return bool(graph.memory.head[tb.POOL_F_END] > MOST_VALUES)
+
+
+def _joint(graph: Graph, *, unit: bool = False) -> FloatArray:
+    """Return the poses of a start by SuperLU; LinearSolveError if it is not for such a graph."""
+    if _is_large(graph):
+        raise LinearSolveError('joint start: the graph is too large and too dense')
+    return linear_starts.joint(graph, unit=unit)
 
 
 def plant(graph: Graph, cliques: symbolic.Cliques) -> None:

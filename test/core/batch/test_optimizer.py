@@ -311,3 +311,13 @@ def test_headings_that_cancel_each_other_out_have_a_start(
     result = optimizer.optimize_from_linear_start(graph, THOROUGH)
     assert (result.status, result.start) == (Status.CONVERGED, Start.UNIT)
     assert result.chi2 <= 1.01 * from_truth.chi2
+
+
+def test_a_graph_too_large_for_superlu_has_the_other_starts(monkeypatch) -> None:
+    graph = corridor_graph(0, 0.3, 150)
+    monkeypatch.setattr(optimizer, 'MOST_VALUES', 0)
+    monkeypatch.setattr(optimizer.linear_starts, 'joint', None)     # not called
+    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
+    assert (result.status, result.start) == (Status.CONVERGED, Start.PRESENT)
+    graph.apply(GraphUpdate(factors=random_observed(np.random.default_rng(0), [1, 5])))
+    assert optimizer.optimize_from_two_starts(graph, THOROUGH).status is Status.CONVERGED
