@@ -322,7 +322,9 @@ def compact(memory: tb.Memory) -> Gone:
         left = rows_now[memory[name][:head[counter]]]
         left = left[left >= 0]
         memory[name][:len(left)], head[counter] = left, len(left)
-    head[tb.NEWEST], head[tb.FIXED] = of_node[head[tb.NEWEST]], of_node[head[tb.FIXED]]
+    head[tb.NEWEST] = of_node[head[tb.NEWEST]]
+    fixed = np.flatnonzero(nodes['fixed'])
+    head[tb.FIXED] = fixed[0] if len(fixed) > 0 else -1
     head[tb.N_LEAVING] = 0
     return Gone(nodes_gone, factors_gone)
 

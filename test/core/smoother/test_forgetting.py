@@ -304,6 +304,15 @@ def test_all_nodes_can_leave_and_the_smoother_goes_on() -> None:
     assert other.newest_pose == first + 1
 
 
+def test_of_two_fixed_nodes_the_other_is_known_when_one_leaves() -> None:
+    smoother, *_ = driven(4, 3)
+    ids = smoother.graph.node_ids
+    smoother.update(GraphUpdate(fix=ids[[0, 2]].tolist()))
+    smoother.forget([int(ids[0])])
+    assert smoother.graph.fixed[smoother.graph.memory.head[tb.FIXED]]
+    assert smoother.graph.node_ids[smoother.graph.fixed].tolist() == [ids[2]]
+
+
 @pytest.mark.parametrize('seed', [57, 97, 294])
 def test_a_step_that_diverges_while_nodes_leave_leaves_no_stale_tables(seed: int) -> None:
     rng = np.random.default_rng(seed)
