@@ -92,94 +92,68 @@ def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-de
 
     Without a second node j is -1.
     """
-    nodes, cliques, m = tb.nodes(head), tb.cliques(head), len(out)
-    out[:] = 0.0
-    if j < 0:
-        _begin(head, i, of_i, -1, np.empty((m, 48)), out)
-        return
-    # Each path to a root goes on along the other one: they meet in the lowest clique above both
-    # nodes, or both end at -1.
-    begin_i, begin_j = nodes[i].clique, nodes[j].clique
-    common, other = begin_i, begin_j
-    while common != other:
-        common = cliques[common].parent if common >= 0 else begin_j
-        other = cliques[other].parent if other >= 0 else begin_i
-    spare = np.empty((m, 96))
-    first, spare, at_i = _begin(head, i, of_i, common, spare, out)
-    second, spare, at_j = _begin(head, j, of_j, common, spare, out)
-    if common >= 0:
-        n = 3 * (cliques[common].n_frontal + cliques[common].n_separator)
-        for r in range(m):
-            for q in range(n):
-                first[r, q] += second[r, q]
-        _climb(head, common, -1, min(at_i, at_j), first, spare, out)
-
-
-@kernel(allocates=True)
-def _begin(head, v, jacobian, top, spare, out):  # type: ignore[no-untyped-def]
-    """
-    Climb from a node to a clique, which is not solved for; -1 to climb beyond the root.
-
-    Add Y^T Y to `out`. Return the right-hand sides of the clique, work space, and the number of
-    its frontal nodes before the first with a nonzero right-hand side.
-    """
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    c = nodes[v].clique
-    row = cliques[c]
-    here = np.zeros((len(jacobian), max(3 * (row.n_frontal + row.n_separator), 48)))
-    first = 0
-    while pool_i[row.members + first] != v:
-        first += 1
-    turn = clique_frames.present_turn(head, c)
-    cos, sin = math.cos(turn), math.sin(turn)
-    for r in range(len(jacobian)):
-        x, y = jacobian[r, 0], jacobian[r, 1]
-        here[r, 3 * first], here[r, 3 * first + 1] = cos * x + sin * y, cos * y - sin * x
-        here[r, 3 * first + 2] = jacobian[r, 2]
-    if c == top:
-        return here, spare, first
-    here, spare = _climb(head, c, top, first, here, spare, out)
-    return here, spare, 0
-
-
-@kernel(allocates=True)
-def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-def]
-    """Solve for the cliques from c up to, and without, one above; return its right-hand sides."""
-    nodes, cliques = tb.nodes(head), tb.cliques(head)
-    pool_i, pool_f = tb.pool_i(head), tb.pool_f(head)
-    while c != top:
+    nodes, cliques, pool_f = tb.nodes(head), tb.cliques(head), tb.pool_f(head)
+    pool_i, m = tb.pool_i(head), len(out)
+    path = _path(head, nodes[i].clique, nodes[j].clique if j >= 0 else -1)
+    # each node of these cliques is frontal in one of them
+    n = largest = 0
+    for c in path:
         row = cliques[c]
-        n_frontal, n = row.n_frontal, row.n_frontal + row.n_separator
-        members, values = pool_i[row.members:row.members + n], pool_f[row.values:]
-        begin = 3 * first   # what is before it is zero
-        for r in range(len(here)):
-            forward_rows(values[row_start(begin, 3 * n) + begin:], 3 * n_frontal - begin,
-                         3 * n - begin, here[r, begin:])
-        for q in range(begin, 3 * n_frontal):
-            for r in range(len(here) if nodes[members[q // 3]].fixed == 0 else 0):
-                for s in range(len(here)):
-                    out[r, s] += here[r, q] * here[s, q]
-        if row.parent < 0:
-            break
-        # the right-hand sides of the separator are those of the parent, in its frame
-        above = cliques[row.parent]
-        n_above = above.n_frontal + above.n_separator
-        if spare.shape[1] < 3 * n_above:
-            spare = np.empty((len(here), 6 * n_above))
-        spare[:, :3 * n_above] = 0.0
-        for m in range(n_above):
-            nodes[pool_i[above.members + m]].index = 3 * m
-        turn = (clique_frames.present_turn(head, c) - clique_frames.present_turn(head, row.parent))
-        cos, sin = math.cos(turn), math.sin(turn)
-        for s in range(n_frontal, n):
-            at = nodes[members[s]].index
-            for r in range(len(here)):
-                x, y = here[r, 3 * s], here[r, 3 * s + 1]
-                spare[r, at], spare[r, at + 1] = cos * x - sin * y, sin * x + cos * y
-                spare[r, at + 2] = here[r, 3 * s + 2]
-        first, c = 0, row.parent
-        here, spare = spare, here
-    return here, spare
+        largest = max(largest, row.n_frontal + row.n_separator)
+        for v in pool_i[row.members:row.members + row.n_frontal]:
+            nodes[v].index = n
+            n += 3
+    # right-hand sides in map axes, of which the solutions of frontal nodes take the place
+    right, x, places = np.zeros((m, n)), np.empty(3 * largest), np.empty(largest, np.int32)
+    right[:, nodes[i].index:nodes[i].index + 3] = of_i
+    if j >= 0:
+        right[:, nodes[j].index:nodes[j].index + 3] += of_j
+    for c in path:
+        row, turn = cliques[c], clique_frames.present_turn(head, c)
+        cos, sin, size = math.cos(turn), math.sin(turn), row.n_frontal + row.n_separator
+        for k in range(size):
+            places[k] = nodes[pool_i[row.members + k]].index
+        for r in range(m):
+            of_r = right[r]
+            for k in range(size):
+                at = places[k]
+                x[3 * k] = cos * of_r[at] + sin * of_r[at + 1]
+                x[3 * k + 1] = cos * of_r[at + 1] - sin * of_r[at]
+                x[3 * k + 2] = of_r[at + 2]
+            forward_rows(pool_f[row.values:], 3 * row.n_frontal, 3 * size, x)
+            for k in range(size):
+                at = places[k]
+                of_r[at] = cos * x[3 * k] - sin * x[3 * k + 1]
+                of_r[at + 1] = sin * x[3 * k] + cos * x[3 * k + 1]
+                of_r[at + 2] = x[3 * k + 2]
+        for k in range(row.n_frontal):
+            if nodes[pool_i[row.members + k]].fixed != 0:
+                right[:, places[k]:places[k] + 3] = 0.0
+    out[:] = 0.0
+    for q in range(n):
+        for r in range(m):
+            for s in range(m):
+                out[r, s] += right[r, q] * right[s, q]
+
+
+@kernel(allocates=True)
+def _path(head, i, j):  # type: ignore[no-untyped-def]
+    """Return the cliques from one, and another one or -1, up to the roots, children first."""
+    cliques, path, n = tb.cliques(head), np.empty(64, np.int32), 0
+    # Each path to a root goes on along the other one: they meet in the lowest clique above both,
+    # or both end at -1.
+    common, other = i, j
+    while common != other:
+        common = cliques[common].parent if common >= 0 else j
+        other = cliques[other].parent if other >= 0 else i
+    for begin, end in ((i, common), (j, common), (common, -1)):
+        c = begin
+        while c != end:
+            if n == len(path):
+                path = grown(path, 0)
+            path[n], c = c, cliques[c].parent
+            n += 1
+    return path[:n]
 
 
 @kernel(signature=(tb.HEAD, MATRICES), allocates=True)
