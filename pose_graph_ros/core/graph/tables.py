@@ -154,8 +154,8 @@ SCALARS: Final = np.dtype([
 TABLES: Final[dict[str, np.dtype[Any]]] = {
     'nodes': NODE, 'factors': FACTOR, 'cliques': CLIQUE, 'scalars': SCALARS,
     **{name: np.dtype(kind) for kind, names in (
-        ('f8', ('pool_f', 'work_f')), ('i8', ('log', 'interrupt')),
-        ('i4', ('pool_i', 'work_i', 'touched', 'freed', 'waiting', 'node_id', 'factor_id')),
+        ('f8', ('pool_f', 'work_f')), ('i8', ('log', 'interrupt', 'touched', 'waiting')),
+        ('i4', ('pool_i', 'work_i', 'freed', 'node_id', 'factor_id')),
     ) for name in names}}
 NAMES: Final = tuple(TABLES)
 REFINEMENT, ALL = range(2)
@@ -242,8 +242,8 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
     return made
 
 
-(nodes, factors, cliques, scalars, pool_f, work_f, log, interrupt, pool_i, work_i, touched, freed,
- waiting, node_id, factor_id) = map(_array, NAMES)
+(nodes, factors, cliques, scalars, pool_f, work_f, log, interrupt, touched, waiting, pool_i,
+ work_i, freed, node_id, factor_id) = map(_array, NAMES)
 # the same memory as numbers of eight bytes
 node_words, factor_words, clique_words, scalar_words = (
     _array(name, types.int64) for name in NAMES[:4])

@@ -6,17 +6,16 @@ The transaction log: `begin` an update, log what it changes, then `commit` or `r
 A rollback restores every row bit for bit. A kernel that changes a row from before the update logs
 the row first; a stamp in the row makes sure that only the first change is logged. Values of
 cliques are never overwritten: new values get memory of their own, and the old ones are given back
-to the pools on commit. The first entry of the log holds the counters, scalars and lists with which
-the update began.
+to the pools on commit. The first entries of the log hold the lists, scalars and counters with
+which the update began.
 """
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import pools, tables as tb
 from pose_graph_ros.core.graph.constraints import NodeKind
 
-# Kinds of entries of the log, which are words of a record, the row of it, and the kind; START has
-# its kind alone behind what `begin` logs.
-NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, START = range(5)
+# Kinds of entries of the log, which are words, the row that these are of, and the kind.
+NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, WAITING, TOUCHED, SCALARS, COUNTERS = range(8)
 _POSE = int(NodeKind.POSE)
 
 
@@ -36,13 +35,6 @@ def copied(source, target):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _append_words(head, words):  # type: ignore[no-untyped-def]
-    begin = head[tb.LOG_END]
-    head[tb.LOG_END] = begin + len(words)
-    copied(words, tb.log(head)[begin:begin + len(words)])
-
-
-@kernel
 def _append(head, kind, row, words):  # type: ignore[no-untyped-def]
     """Append an entry."""
     log, begin = tb.log(head), head[tb.LOG_END]
@@ -54,14 +46,22 @@ def _append(head, kind, row, words):  # type: ignore[no-untyped-def]
 
 @kernel(inline='always')    # Numba returns no arrays but arguments otherwise
 def _words(head, kind, row):  # type: ignore[no-untyped-def]
-    """Return the words of a record that an entry of a kind holds."""
+    """Return the words that an entry of a kind holds."""
     if kind == NODE:
         return tb.node_words(head)[row]
     if kind == FACTOR:
         return tb.factor_words(head)[row]
     if kind == CLIQUE:
         return tb.clique_words(head)[row]
-    return tb.clique_words(head)[row, :0]
+    if kind == WAITING:
+        return tb.waiting(head)[:head[tb.N_WAITING]]
+    if kind == TOUCHED:
+        return tb.touched(head)[:head[tb.N_TOUCHED]]
+    if kind == SCALARS:
+        return tb.scalar_words(head)[0]
+    if kind == COUNTERS:
+        return head[tb.N_NODES:tb.LOOSE + 1]
+    return head[:0]     # of a clique that was taken only the row matters
 
 
 @kernel
@@ -111,7 +111,7 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row.built = head[tb.ITERATION]
     row.drift = 0.0
     row.born = row.values_born = row.logged = head[tb.UPDATE]
-    _append(head, TAKEN_CLIQUE, c, tb.clique_words(head)[c, :0])
+    _append(head, TAKEN_CLIQUE, c, _words(head, TAKEN_CLIQUE, c))
     return c
 
 
@@ -153,15 +153,11 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,))
 def begin(head):  # type: ignore[no-untyped-def]
-    """Log counters, scalars and lists."""
+    """Log lists, scalars and counters: a rollback restores the lengths of the lists first."""
     head[tb.UPDATE] += 1
     head[tb.LOG_END] = head[tb.N_FREED] = 0
-    _append_words(head, head[tb.N_NODES:tb.LOOSE + 1])
-    _append_words(head, tb.scalar_words(head)[0])
-    _append_words(head, tb.touched(head)[:head[tb.N_TOUCHED]])
-    _append_words(head, tb.waiting(head)[:head[tb.N_WAITING]])
-    tb.log(head)[head[tb.LOG_END]] = START
-    head[tb.LOG_END] += 1
+    for kind in range(WAITING, COUNTERS + 1):
+        _append(head, kind, 0, _words(head, kind, 0))
 
 
 @kernel(signature=(tb.HEAD,))
@@ -190,7 +186,7 @@ def _entry(head, end):  # type: ignore[no-untyped-def]
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all that was logged since `begin`, the newest entry first."""
     log, pool_f, end = tb.log(head), tb.pool_f(head), head[tb.LOG_END]
-    while end > 0 and log[end - 1] != START:
+    while end > 0:
         end, at, kind = _entry(head, end)
         if kind == TAKEN_CLIQUE:
             if tb.cliques(head)[at].n_frontal >= 0:     # else the same update has given it back
@@ -208,13 +204,6 @@ def rollback(head):  # type: ignore[no-untyped-def]
         copied(log[end:], tb.clique_words(head)[at])
         if row.values != values:
             pools.give(head, pools.VALUES, values, size)
-    if end > 0:
-        counters, scalars = head[tb.N_NODES:tb.LOOSE + 1], tb.scalar_words(head)[0]
-        copied(log, counters)
-        copied(log[len(counters):], scalars)
-        lists, n_touched = log[len(counters) + len(scalars):], head[tb.N_TOUCHED]
-        copied(lists, tb.touched(head)[:n_touched])
-        copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
     head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
@@ -222,7 +211,7 @@ def rollback(head):  # type: ignore[no-untyped-def]
 def largest_move(head):  # type: ignore[no-untyped-def]
     """Return by how much the update has moved poses: the largest change of a coordinate [m]."""
     nodes, log, end, largest = tb.nodes(head), tb.log(head), head[tb.LOG_END], 0.0
-    while end > 0 and log[end - 1] != START:
+    while end > 0 and log[end - 1] != COUNTERS:
         end, row, kind = _entry(head, end)
         if kind == NODE and nodes[row].kind == _POSE:
             for k in range(2):
