@@ -134,13 +134,6 @@ class Graph:
         chosen[self.node_rows(nodes)] = True
         return self.factor_ids[np.any(chosen[self.factor_records['ends']], axis=1)]
 
-    def leaving(self) -> GraphUpdate:
-        """Return what leaves the graph with the present update; it keeps its rows until then."""
-        nodes, factors = (ids[links == tb.LEAVES].tolist() for ids, links in (
-            (self.node_ids, self.node_records['factor_list']),
-            (self.factor_ids, self.factor_records['next'][:, 0])))
-        return GraphUpdate(remove_nodes=nodes, drop=factors)
-
     # --- hidden nodes ---------------------------------------------------------------------------
 
     @property

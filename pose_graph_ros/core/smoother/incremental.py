@@ -99,7 +99,7 @@ class IncrementalSmoother:
         """
         with _Editing(self.graph):
             self.graph.apply(update)
-            return self._step(step.FIRST, fall_back=fall_back)
+            return self._step(step.FIRST, update if fall_back else None)
 
     def append(self, update: GraphUpdate) -> bool:
         """
@@ -235,7 +235,7 @@ class IncrementalSmoother:
                 if not forgetting.touch_mixed(head, rows, again):
                     self.graph.rollback()
                     break
-                result = self._step(step.FIRST)
+                result = self._step(step.FIRST, GraphUpdate())
             if result.status is Status.FAILED:
                 raise GraphUpdateError(f'forget: {result.reason}')
         else:
@@ -334,29 +334,28 @@ class IncrementalSmoother:
         self.graph.begin()
         return self._step(step.AFTER_BATCH)
 
-    def _step(self, entered: int, *, fall_back: bool = True) -> UpdateResult:
-        """Bring the estimate up to date, growing the memory as needed, or roll the update back."""
+    def _step(self, entered: int, again: GraphUpdate | None = None) -> UpdateResult:
+        """
+        Bring the estimate up to date, growing the memory as needed, or roll the update back.
+
+        If the iterations diverge, the batch optimiser begins again with the update, if given.
+        """
         head = self._memory.head
         iterations = self._config.max_iterations
         while (code := step.run(head, iterations, entered)) == tree_update.MORE_MEMORY:
             self._make_room()
             entered = step.AFTER_BATCH if entered == step.AFTER_BATCH else step.RESUMED
-        if code == tree_update.DIVERGED and (entered == step.AFTER_BATCH or not fall_back):
-            self.graph.rollback()
-            return UpdateResult(Status.FAILED, DIVERGED)
-        if code == tree_update.DIVERGED:
-            return self._fall_back_to_batch()
+        if code in (tree_update.DONE, tree_update.UNFINISHED):
+            self.graph.commit()
+            status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
+            return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+        reason = DIVERGED if code == tree_update.DIVERGED else INTERRUPTED
         if code == tree_update.BAD_PIVOT:
-            node = self.graph.node_ids[head[tb.BAD_NODE]]
-            reason = f'hidden node {node} is not determined'
-            self.graph.rollback()
-            return UpdateResult(Status.FAILED, reason)
-        if code == tree_update.INTERRUPTED:
-            self.graph.rollback()
-            return UpdateResult(Status.FAILED, INTERRUPTED)
-        self.graph.commit()
-        status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
-        return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+            reason = f'hidden node {self.graph.node_ids[head[tb.BAD_NODE]]} is not determined'
+        self.graph.rollback()
+        if code == tree_update.DIVERGED and again is not None:
+            return self._fall_back_to_batch(again)
+        return UpdateResult(Status.FAILED, reason)
 
     def _make_room(self) -> None:
         """Let the pools and the work space grow to what a kernel needs."""
@@ -366,18 +365,14 @@ class IncrementalSmoother:
         memory.ensure('pool_i', integers, keep=int(head[tb.POOL_I_END]))
         memory.ensure('work_f', work)
 
-    def _fall_back_to_batch(self) -> UpdateResult:
+    def _fall_back_to_batch(self, update: GraphUpdate) -> UpdateResult:
         """
         Restart from the poses that the batch optimiser finds, with all nodes eliminated anew.
 
-        This is done on a copy, which replaces the graph on success.
+        This is done on a copy with the update, which replaces the graph on success.
         """
-        rows, leaving = self.graph.rows(), self.graph.leaving()
-        self.graph.rollback()
-        # the start if the linear start leads to a higher chi2
-        rows.poses[:self.graph.n_nodes] = self.graph.poses
         other = IncrementalSmoother(self._config, Graph(self.graph))
-        if trial.optimize_copy(other.graph, rows, leaving):
+        if trial.optimize_copy(other.graph, self.graph.rows(), update):
             result = other._eliminate()
             if result.status is not Status.FAILED:
                 self._memory.take(other.graph.memory)

@@ -41,10 +41,10 @@ _CONFIG = SolverConfig(max_iterations=optimizer.TRUSTED_ITERATIONS, step_toleran
 _STARTS = (Start.CHORDAL, Start.PRESENT)
 
 
-def optimize_copy(copy: Graph, rows: GraphRows, leaving: GraphUpdate) -> bool:
-    """Return whether the batch optimiser finds a solution for a copy, once some of it has left."""
+def optimize_copy(copy: Graph, rows: GraphRows, update: GraphUpdate) -> bool:
+    """Return whether the batch optimiser finds a solution for a copy with an update."""
     copy.fill(rows)
-    copy.apply(leaving)
+    copy.apply(update)
     result = optimizer.optimize(copy, _OF_STEP, _STARTS_OF_STEP)
     if result.status is Status.FAILED:
         return False
