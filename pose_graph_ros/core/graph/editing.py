@@ -31,7 +31,6 @@ ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
 NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
-_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -105,10 +104,10 @@ def weigh(head, e, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, jit.INTEGERS, jit.NUMBERS))
-def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
-    """Set weights of factors, by id; 0 takes one out of its lists, DROPPED out of the graph."""
-    for m in range(len(ids)):
-        e = rows.factor_row(head, ids[m])
+def set_weights(head, chosen, weights):  # type: ignore[no-untyped-def]
+    """Set weights of factors, by row; 0 takes one out of its lists, DROPPED out of the graph."""
+    for m in range(len(chosen)):
+        e = chosen[m]
         weigh(head, e, max(weights[m], 0.0))
         f = tb.factors(head)[e]
         if weights[m] == DROPPED and f.next[0] != tb.LEAVES:
@@ -118,10 +117,10 @@ def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, jit.INTEGERS, jit.ROWS, jit.MATRICES))
-def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
-    """Give factors, by id, other measurements."""
-    for m in range(len(ids)):
-        e = rows.factor_row(head, ids[m])
+def measure(head, chosen, means, informations):  # type: ignore[no-untyped-def]
+    """Give factors, by row, other measurements."""
+    for m in range(len(chosen)):
+        e = chosen[m]
         f = tb.factors(head)[e]
         weight = f.weight
         transaction_log.log_factor(head, e)
@@ -132,29 +131,24 @@ def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, jit.INTEGERS, jit.FLAG))
-def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
-    """Fix hidden nodes, by id, at their present poses, or free them."""
+def set_fixed(head, chosen, fixed):  # type: ignore[no-untyped-def]
+    """Fix hidden nodes, by row, at their present poses, or free them."""
     nodes = tb.nodes(head)
-    for number in ids:
-        v = rows.node_row(head, number)
+    for v in chosen:
         if (nodes[v].fixed != 0) != fixed:
             transaction_log.log_node(head, v)
             nodes[v].fixed = 1 if fixed else 0
             touch(head, v)
-    if fixed or head[tb.FIXED] >= 0:
-        _find_fixed(head)
 
 
-@kernel
-def _find_fixed(head):  # type: ignore[no-untyped-def]
-    """Look for a fixed node that does not leave, unless the known one is."""
-    nodes, v = tb.nodes(head), np.int64(max(head[tb.FIXED], 0))
-    for _ in range(head[tb.N_NODES]):
-        if nodes[v].fixed != 0 and nodes[v].factor_list != tb.LEAVES:
-            head[tb.FIXED] = v
-            return
-        v = (v + 1) % head[tb.N_NODES]
-    head[tb.FIXED] = -1
+def find_ends(memory: tb.Memory) -> None:
+    """Note the newest pose and the first fixed node, of those that do not leave."""
+    nodes = memory['nodes'][:memory.head[tb.N_NODES]]
+    stays = nodes['factor_list'] != tb.LEAVES
+    for counter, of_kind, place in ((tb.NEWEST, nodes['kind'] == np.uint8(NodeKind.POSE), -1),
+                                    (tb.FIXED, nodes['fixed'] != 0, 0)):
+        found = np.flatnonzero(stays & of_kind)
+        memory.head[counter] = found[place] if len(found) > 0 else -1
 
 
 @kernel(signature=(tb.HEAD, jit.ROWS, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
@@ -236,7 +230,10 @@ def settle(head):  # type: ignore[no-untyped-def]
             chi2 += f.energy
             error2 += f.error2
     scalars.chi2 = chi2
-    prior_rows.add_energies(head)
+    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
+        if prior_rows.is_prior(head, c):
+            tb.cliques(head)[c].energy = 0.0
+            prior_rows.update_energy(head, c)
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars.budget < error2:
         return
@@ -251,43 +248,46 @@ def settle(head):  # type: ignore[no-untyped-def]
 
 # --- removal for good, in two steps --------------------------------------------------------------
 
-@kernel(signature=(tb.HEAD, jit.INTEGERS))
-def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
-    """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
-    nodes, cliques = tb.nodes(head), tb.cliques(head)
-    for number in ids:
-        v = rows.node_row(head, number)
+@kernel
+def touch_with(head, v, spared):  # type: ignore[no-untyped-def]
+    """
+    Touch a node, and one of each clique that has it, but for those that are spared.
+
+    They are a subtree below the clique that it is frontal in. A clique may have it in the
+    separator although no constraint below leads to it any more.
+    """
+    nodes, cliques, stack = tb.nodes(head), tb.cliques(head), tb.work_i(head)
+    transaction_log.log_node(head, v)
+    touch(head, v)
+    stack[0], depth = nodes[v].clique, 1 if nodes[v].clique >= 0 else 0
+    while depth > 0:
+        depth -= 1
+        c = cliques[stack[depth]].child
+        while c >= 0:
+            if (cliques[c].n_frontal > 0 and not spared[c]
+                    and prior_rows.is_in_separator(head, c, v)):
+                other = tb.pool_i(head)[cliques[c].members]
+                transaction_log.log_node(head, other)
+                touch(head, other)
+                stack[depth] = c
+                depth += 1
+            c = cliques[c].sibling
+
+
+@kernel(signature=(tb.HEAD, jit.INTEGERS), allocates=True)
+def remove_nodes(head, chosen):  # type: ignore[no-untyped-def]
+    """Take hidden nodes, by row, out of the graph with all their factors; rows leave later."""
+    nodes, spared = tb.nodes(head), np.zeros(head[tb.N_CLIQUES], np.bool_)
+    for v in chosen:
         prior_rows.remove_of_node(head, v)
         if nodes[v].factor_list == tb.LEAVES:
             continue
-        transaction_log.log_node(head, v)
         while nodes[v].factor_list >= 0:
             weigh(head, nodes[v].factor_list >> 2, 0.0)
-        # Touch a node of each clique that has it, so that all of them are built anew. They are a
-        # subtree below the clique that it is frontal in. A clique may have it in the separator
-        # although no constraint below leads to it any more.
-        top = parent = nodes[v].clique
-        c = cliques[top].child if top >= 0 else -1
-        while c >= 0 or parent != top:
-            if c >= 0 and prior_rows.is_in_separator(head, c, v):
-                u = tb.pool_i(head)[cliques[c].members]
-                transaction_log.log_node(head, u)
-                touch(head, u)
-                parent, c = c, cliques[c].child
-            elif c >= 0:
-                c = cliques[c].sibling
-            else:
-                c, parent = cliques[parent].sibling, cliques[parent].parent
-        touch(head, v)
+        touch_with(head, v, spared)
         nodes[v].factor_list = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
-    v = head[tb.NEWEST]     # the last pose that does not leave
-    while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
-        v -= 1
-    head[tb.NEWEST] = v
-    if head[tb.FIXED] >= 0:
-        _find_fixed(head)
 
 
 def compact(memory: tb.Memory) -> Gone:
@@ -322,9 +322,7 @@ def compact(memory: tb.Memory) -> Gone:
         left = rows_now[memory[name][:head[counter]]]
         left = left[left >= 0]
         memory[name][:len(left)], head[counter] = left, len(left)
-    head[tb.NEWEST] = of_node[head[tb.NEWEST]]
-    fixed = np.flatnonzero(nodes['fixed'])
-    head[tb.FIXED] = fixed[0] if len(fixed) > 0 else -1
+    find_ends(memory)
     head[tb.N_LEAVING] = 0
     return Gone(nodes_gone, factors_gone)
 

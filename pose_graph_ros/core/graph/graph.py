@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose graph: hidden nodes and factors, as tables of records."""
 
-from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -28,10 +27,6 @@ _HAS_CONSTANTS = np.array([np.isin(range(4), factor.constants) for factor in FAC
 
 # By kind, whether factors are between nodes that are no biases.
 _ARE_EDGES = np.array([factor.j not in {(), (NodeKind.BIAS,)} for factor in FACTORS.values()])
-
-
-def _integers(numbers: Collection[int]) -> IntArray:
-    return np.fromiter(numbers, np.int64, len(numbers))
 
 
 class Graph:
@@ -306,17 +301,20 @@ class Graph:
         weights = {**dict.fromkeys(update.remove, 0.0), **update.weigh,
                    **dict.fromkeys(update.drop, editing.DROPPED)}
         if len(weights) > 0:
-            editing.set_weights(
-                head, _integers(weights), np.fromiter(weights.values(), np.float64, len(weights)))
+            ids = np.fromiter(weights, np.int64, len(weights))
+            editing.set_weights(head, self.factor_rows(ids), np.fromiter(
+                weights.values(), np.float64, len(weights)))
         for measured in update.measure:
-            editing.measure(head, _integers(measured.ids), *map(
+            editing.measure(head, self.factor_rows(measured.ids), *map(
                 np.ascontiguousarray, (measured.mean, measured.information)))
             self.n_moves += 1
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
-                editing.set_fixed(head, _integers(nodes), fixed)
+                editing.set_fixed(head, self.node_rows(nodes), fixed)
         if len(update.remove_nodes) > 0:
-            editing.remove_nodes(head, _integers(update.remove_nodes))
+            editing.remove_nodes(head, self.node_rows(update.remove_nodes))
+        if any(map(len, (update.fix, update.free, update.remove_nodes))):
+            editing.find_ends(self.memory)
         if len(update.priors) > 0:
             self.ensure(self.n_nodes + len(update.priors), self.n_factors)
             add_priors(self.memory, update.priors, [
@@ -384,8 +382,7 @@ class Graph:
         new = self.node_records[begin:]
         new['kind'] = rows.node_kind
         new['dimension'] = rows.dimension
-        poses = np.flatnonzero(self.is_pose)
-        self.memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
+        editing.find_ends(self.memory)
         self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,
                      rows.next_ids.factor)
         self.apply(GraphUpdate(fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))

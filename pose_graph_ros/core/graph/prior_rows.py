@@ -149,15 +149,6 @@ def update_energy(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_energies(head):  # type: ignore[no-untyped-def]
-    """Evaluate all priors at the present poses and add their energies to chi2."""
-    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
-        if is_prior(head, c):
-            tb.cliques(head)[c].energy = 0.0
-            update_energy(head, c)
-
-
-@kernel
 def diagonal(head, c, k):  # type: ignore[no-untyped-def]
     """Return the mean information of an update matrix on a node's position, and on its heading."""
     update, n, i = pools.update_matrix(head, c), 3 * tb.cliques(head)[c].n_separator, 3 * k

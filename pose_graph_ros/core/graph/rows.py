@@ -25,37 +25,26 @@ _ROWS = np.array([sum(1 << row for row in factor.rows) for factor in FACTORS.val
 
 
 @kernel
-def _row(number, ids, n, next_id):  # type: ignore[no-untyped-def]
-    """Return the row of an id among the first n, -1 if it has left; new ones are behind them."""
-    if number >= next_id:
-        return n + number - next_id
-    if next_id == n:    # nothing has left: ids are rows
-        return number
-    low, high = 0, n
-    while low < high:
-        middle = (low + high) // 2
-        if ids[middle] < number:
-            low = middle + 1
-        else:
-            high = middle
-    return low if low < n and ids[low] == number else -1
-
-
-@kernel
-def node_row(head, node):  # type: ignore[no-untyped-def]
+def _node_row(head, node):  # type: ignore[no-untyped-def]
     """
     Return the row of a hidden node, negative if it has left the graph.
 
     The next new ids have the rows behind the last, so those of an update that is being added are
     found as well.
     """
-    return _row(node, tb.node_id(head), head[tb.N_NODES], head[tb.NEXT_NODE])
-
-
-@kernel
-def factor_row(head, number):  # type: ignore[no-untyped-def]
-    """Return the row of a factor that is in the graph, by its id."""
-    return _row(number, tb.factor_id(head), head[tb.N_FACTORS], head[tb.NEXT_FACTOR])
+    ids, n, next_id = tb.node_id(head), head[tb.N_NODES], head[tb.NEXT_NODE]
+    if node >= next_id:
+        return n + node - next_id
+    if next_id == n:    # nothing has left: ids are rows
+        return node
+    low, high = 0, n
+    while low < high:
+        middle = (low + high) // 2
+        if ids[middle] < node:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < n and ids[low] == node else -1
 
 
 @kernel
@@ -196,7 +185,7 @@ def write_rows(head, n_nodes, records):  # type: ignore[no-untyped-def]
     valid = True
     for k in range(len(records)):
         e, new, kind = head[tb.N_FACTORS] + k, records[k], records[k].kind
-        a, b, c = node_row(head, new.i), node_row(head, new.j), node_row(head, new.k)
+        a, b, c = _node_row(head, new.i), _node_row(head, new.j), _node_row(head, new.k)
         valid = write_row(head, e, a, b, new.mean, new.information, kind, new.weight) and valid
         f = tb.factors(head)[e]
         f.ends[2] = c

@@ -16,9 +16,9 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import unlink
+from pose_graph_ros.core.graph.editing import touch_with, unlink
 from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
-from pose_graph_ros.core.graph.rows import scale_by, touch
+from pose_graph_ros.core.graph.rows import scale_by
 from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
 
@@ -70,32 +70,15 @@ def touch_mixed(head, leaving, all_of_them):  # type: ignore[no-untyped-def]
     leaving nodes are ordered before all others, or `all_of_them` are. The caller has begun an
     update.
     """
-    cliques = tb.cliques(head)
-    nodes, pool_i, stack = tb.nodes(head), tb.pool_i(head), tb.work_i(head)
+    nodes, mixed = tb.nodes(head), False
     whole, _ = _whole(head, leaving)
-    mixed = False
     for v in leaving:
         mixed = mixed or not whole[nodes[v].clique]
     for v in leaving:
         if not mixed or (whole[nodes[v].clique] and not all_of_them):
             continue
-        transaction_log.log_node(head, v)
-        touch(head, v)
+        touch_with(head, v, whole)
         nodes[v].touched = ORDERED_FIRST
-        stack[0] = nodes[v].clique
-        depth = 1
-        while depth > 0:
-            depth -= 1
-            child = cliques[stack[depth]].child
-            while child >= 0:
-                if (cliques[child].n_frontal > 0 and not whole[child]
-                        and prior_rows.is_in_separator(head, child, v)):
-                    other = pool_i[cliques[child].members]
-                    transaction_log.log_node(head, other)
-                    touch(head, other)
-                    stack[depth] = child
-                    depth += 1
-                child = cliques[child].sibling
     if mixed:
         head[tb.STRUCTURE] = 1
     return mixed
