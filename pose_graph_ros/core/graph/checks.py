@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which ids are in use, and checks of all that goes into a graph; they raise GraphUpdateError."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.covariance import scaled
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind, RECORD
+from pose_graph_ros.core.graph.graph_update import GraphUpdate
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
@@ -166,26 +167,31 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
 _BIASES = np.full(64, NodeKind.BIAS, np.uint8)
 
 
-def other_nodes(biases: FloatArray, dimensions: Sequence[int],
-                landmarks: FloatArray) -> tuple[npt.NDArray[Any], ...]:
+def new_nodes(update: GraphUpdate) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
     """
-    Return values, shape (S + L, 3), and types of new nodes that are no poses.
+    Return values, shape (N, 3), and types of new nodes.
 
-    A type is the `NodeKind`, plus 4 for each coordinate that the node has less than 3.
+    A type is the `NodeKind`, plus 4 for each coordinate that the node has less than 3. Those of
+    one kind alone are returned as they are.
     """
+    hidden, _, biases, dimensions, landmarks = update[:5]
     n = len(biases)
-    if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
+    if n == len(landmarks) == 0:
+        return hidden, np.zeros(len(hidden), np.uint8)
+    if len(hidden) == len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
         return biases, _BIASES[:n]
-    biases, points = checked_poses('biases', biases), np.asarray(landmarks, dtype=np.float64)
+    hidden, biases = checked_poses('hidden', hidden), checked_poses('biases', biases)
+    points = np.asarray(landmarks, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise GraphUpdateError(f'landmarks: expected shape (L, 2), got {points.shape}')
     given = np.asarray(dimensions if len(dimensions) > 0 else np.full(n, 3))
     if given.shape != (n,) or not np.all(np.isin(given, (1, 2, 3))):
         raise GraphUpdateError(
             f'dimensions: expected 1, 2 or 3 for each of {n} biases, got {given.tolist()}')
-    dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
-    values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
-    kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
+    dimension = np.concatenate((
+        np.full(len(hidden), 3), given, np.full(len(points), 2))).astype(np.uint8)
+    values = np.concatenate((hidden, biases, np.pad(points, ((0, 0), (0, 1)))))
+    kind = np.repeat(np.array(list(NodeKind), np.uint8), (len(hidden), n, len(points)))
     return np.where(np.arange(3) < dimension[:, None], values, 0.0), kind + 4 * (3 - dimension)
 
 

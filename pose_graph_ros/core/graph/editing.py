@@ -32,6 +32,7 @@ ADDED, NO_ROOM, UNSOUND = range(3)
 DROPPED = -1.0
 NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
 
+_POSE = int(NodeKind.POSE)
 
 @kernel
 def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
@@ -145,32 +146,29 @@ def find_ends(memory: tb.Memory) -> None:
     """Note the newest pose and the first fixed node, of those that do not leave."""
     nodes = memory['nodes'][:memory.head[tb.N_NODES]]
     stays = nodes['factor_list'] != tb.LEAVES
-    for counter, of_kind, place in ((tb.NEWEST, nodes['kind'] == np.uint8(NodeKind.POSE), -1),
+    for counter, of_kind, place in ((tb.NEWEST, nodes['kind'] == np.uint8(_POSE), -1),
                                     (tb.FIXED, nodes['fixed'] != 0, 0)):
         found = np.flatnonzero(stays & of_kind)
         memory.head[counter] = found[place] if len(found) > 0 else -1
 
 
-@kernel(signature=(tb.HEAD, jit.ROWS, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
-def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
+def add_rows(head, values, types, records, checked):  # type: ignore[no-untyped-def]
     """
     Return ADDED after adding hidden nodes and factors, all of them, or why none.
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
-    `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their types of `checks.other_nodes`; the records are those of `Factors`.
+    `checks.check` has not accepted them (`checked`). Nodes are given by their values and types, as
+    by `checks.new_nodes`; the records are those of `Factors`.
     """
-    first = head[tb.N_NODES]
-    first_other = first + len(hidden)
-    n_nodes = first_other + len(others)
-    n_factors = head[tb.N_FACTORS] + len(records)
-    if hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others):
+    nodes, first = tb.nodes(head), head[tb.N_NODES]
+    n_nodes, n_factors = first + len(values), head[tb.N_FACTORS] + len(records)
+    if values.shape[1] != 3 or len(types) != len(values):
         return UNSOUND
     if n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_factors > head[tb.FACTOR_ROOM]:
         return NO_ROOM
     # rows behind the ends are not part of the graph yet
-    valid = rows.write_nodes(head, first, hidden, types[:0])
-    valid = rows.write_nodes(head, first_other, others, types) and valid
+    valid = rows.write_nodes(head, first, values, types)
     valid = rows.write_rows(head, n_nodes, records) and valid
     if not valid and not checked:
         return UNSOUND
@@ -181,8 +179,8 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
         head[tb.NEXT_NODE] += 1
         touch(head, v)
         head[tb.STRUCTURE] = 1
-    if first_other > first:
-        head[tb.NEWEST] = first_other - 1
+        if nodes[v].kind == _POSE:
+            head[tb.NEWEST] = v
     head[tb.N_FACTORS] = n_factors
     for e in range(n_factors - len(records), n_factors):
         f = tb.factors(head)[e]

@@ -262,23 +262,24 @@ class Graph:
         edits = update.edits
         if edits:
             self._check_edits(update)
-        others = checks.other_nodes(update.biases, update.dimensions, update.landmarks)
-        columns: tuple[npt.NDArray[Any], ...] = ()
+        self._add(*checks.new_nodes(update), update.factors)
+        if edits:
+            self._edit(update)
+
+    def _add(self, values: FloatArray, types: npt.NDArray[np.uint8], factors: Factors) -> None:
+        """Add nodes, given by `checks.new_nodes`, and factors; raise GraphUpdateError if bad."""
         checked = False
         try:
-            columns = update.hidden, *others, update.factors.records
-            code = editing.add_rows(self.memory.head, *columns, checked)
+            code = editing.add_rows(self.memory.head, values, types, factors.records, checked)
         except (TypeError, ValueError):
             code = editing.UNSOUND  # arrays of types that the kernel is not compiled for
         while code != editing.ADDED:
             if code == editing.NO_ROOM:
-                self.ensure(self.n_nodes + len(update.hidden) + len(others[0]),
-                            self.n_factors + len(update.factors))
+                self.ensure(self.n_nodes + len(types), self.n_factors + len(factors))
             else:
-                columns, checked = self._checked_columns(update, others), True
-            code = editing.add_rows(self.memory.head, *columns, checked)
-        if edits:
-            self._edit(update)
+                values, factors = self._checked(values, types, factors)
+                checked = True
+            code = editing.add_rows(self.memory.head, values, types, factors.records, checked)
 
     def _check_edits(self, update: GraphUpdate) -> None:
         """Raise GraphUpdateError for unknown ids or invalid weights; new rows may be edited."""
@@ -322,19 +323,14 @@ class Graph:
         if not self._updating:
             editing.compact(self.memory)
 
-    def _checked_columns(self, update: GraphUpdate,
-                         others: tuple[npt.NDArray[Any], ...]) -> tuple[npt.NDArray[Any], ...]:
+    def _checked(self, values: FloatArray, types: npt.NDArray[np.uint8],
+                 factors: Factors) -> tuple[FloatArray, Factors]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
-        hidden = checks.checked_poses('hidden', update.hidden)
-        others = (checks.checked_poses('biases', others[0]), *others[1:])
-        kind, dimension = (np.concatenate((present, np.full(len(hidden), usual), new))
-                           for present, usual, new in (
-                               (self.node_kind, 0, others[1] & 3),
-                               (self.dimension, 3, 3 - (others[1] >> 2))))
-        nodes = self._ids('node').extended(len(hidden) + len(others[0]))
-        factors = update.factors if len(update.factors) > 0 else Factors()
-        checks.check(factors, kind, dimension, nodes)
-        return tuple(np.array(column, order='C') for column in (hidden, *others, factors.records))
+        values = checks.checked_poses('biases' if np.any(types) else 'hidden', values)
+        kind = np.concatenate((self.node_kind, types & 3))
+        dimension = np.concatenate((self.dimension, 3 - (types >> 2)))
+        checks.check(factors, kind, dimension, self._ids('node').extended(len(types)))
+        return np.array(values, order='C'), Factors.of(np.array(factors.records, order='C'))
 
     def ensure(self, n_nodes: int, n_factors: int) -> None:
         """Make the tables and the transaction log large enough for a graph of this size."""
@@ -377,21 +373,18 @@ class Graph:
         The ids must be above those that this graph has or had, as in an empty one, and ascending.
         Raises GraphUpdateError if they are not, or a row is invalid.
         """
-        self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
-        begin = self.n_nodes - len(rows.poses)
-        new = self.node_records[begin:]
-        new['kind'] = rows.node_kind
-        new['dimension'] = rows.dimension
-        editing.find_ends(self.memory)
-        self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,
+        types = (rows.node_kind + 4 * (3 - rows.dimension)).astype(np.uint8)
+        self._append('node', rows.poses, types, Factors(), rows.node_ids, rows.next_ids.node)
+        self._append('factor', rows.poses[:0], types[:0], rows.factors, rows.factor_ids,
                      rows.next_ids.factor)
-        self.apply(GraphUpdate(fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))
+        self.apply(GraphUpdate(fix=rows.node_ids[rows.fixed].tolist(), priors=rows.priors))
 
-    def _append(self, name: str, update: GraphUpdate, ids: IntArray, next_id: int) -> None:
+    def _append(self, name: str, values: FloatArray, types: npt.NDArray[np.uint8],
+                factors: Factors, ids: IntArray, next_id: int) -> None:
         """Add new rows of one table with given ids instead of the next ones."""
         head, n_rows, counter = self.memory.head, *COUNTERS[name]
         begin, first = int(head[n_rows]), int(head[counter])
-        self.apply(update)
+        self._add(values, types, factors)
         if len(ids) != head[n_rows] - begin or np.any(np.diff(ids, prepend=first - 1) <= 0):
             raise GraphUpdateError(f'{name}: expected ascending ids from {first} on, one a row')
         self.memory[f'{name}_id'][begin:head[n_rows]] = ids

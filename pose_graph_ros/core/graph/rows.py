@@ -154,11 +154,11 @@ def write_nodes(head, first, poses, types):  # type: ignore[no-untyped-def]
     """
     Write new hidden nodes, headings wrapped; return whether all poses are finite.
 
-    The types are those of `checks.other_nodes`; nodes without one are poses.
+    The types are those of `checks.new_nodes`.
     """
     valid = True
     for k in range(len(poses)):
-        node, code = tb.nodes(head)[first + k], np.int64(types[k]) if len(types) > 0 else 0
+        node, code = tb.nodes(head)[first + k], np.int64(types[k])
         node.kind, node.dimension = code & 3, 3 - (code >> 2)
         for m in range(3):
             node.pose[m] = poses[k, m]
