@@ -86,7 +86,6 @@ def weigh(head, e, weight):  # type: ignore[no-untyped-def]
         head[tb.STRUCTURE] = 1
     for v in f.ends:
         if v >= 0:
-            transaction_log.log_node(head, v)
             touch(head, v)
     rows.scale_by(head, e, weight - before)
     tb.scalars(head)[0].chi2 -= f.energy
@@ -136,9 +135,8 @@ def set_fixed(head, chosen, fixed):  # type: ignore[no-untyped-def]
     """Fix hidden nodes, by row, at their present poses, or free them."""
     nodes = tb.nodes(head)
     for v in chosen:
-        if (nodes[v].fixed != 0) != fixed:
-            transaction_log.log_node(head, v)
             nodes[v].fixed = 1 if fixed else 0
+        if (nodes[v].fixed != 0) != fixed:
             touch(head, v)
 
 
@@ -199,10 +197,10 @@ def add_rows(head, values, types, records, checked):  # type: ignore[no-untyped-
 def restart(head):  # type: ignore[no-untyped-def]
     """Remove all cliques but the priors, linearize all factors anew and touch all nodes."""
     prior_rows.remove_cliques(head)
-    head[tb.N_TOUCHED], head[tb.STRUCTURE] = 0, 1
+    head[tb.N_TOUCHED], head[tb.STRUCTURE] = head[tb.N_NODES], 1
     for v in range(head[tb.N_NODES]):
-        tb.nodes(head)[v].clique, tb.nodes(head)[v].touched = -1, 0
-        touch(head, v)
+        tb.nodes(head)[v].clique, tb.nodes(head)[v].touched = -1, 1
+        tb.touched(head)[v] = v
     factors.linearize_all(head)
     settle(head)
 
@@ -255,7 +253,6 @@ def touch_with(head, v, spared):  # type: ignore[no-untyped-def]
     separator although no constraint below leads to it any more.
     """
     nodes, cliques, stack = tb.nodes(head), tb.cliques(head), tb.work_i(head)
-    transaction_log.log_node(head, v)
     touch(head, v)
     stack[0], depth = nodes[v].clique, 1 if nodes[v].clique >= 0 else 0
     while depth > 0:

@@ -251,7 +251,6 @@ def add_to_scales(head, c, sign):  # type: ignore[no-untyped-def]
 def _touch_nodes(head, c, sign):  # type: ignore[no-untyped-def]
     """Touch the nodes of a prior, and add its information to their scales, or subtract it."""
     for v in pools.separator(head, c):
-        transaction_log.log_node(head, v)
         touch(head, v)
     add_to_scales(head, c, sign)
     head[tb.STRUCTURE] = 1

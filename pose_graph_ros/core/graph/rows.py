@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import FACTORS, NodeKind
 
 # By kind of factors: bits of the kinds of nodes (1 << kind) that its ends may be, END_J also none
@@ -49,7 +49,8 @@ def _node_row(head, node):  # type: ignore[no-untyped-def]
 
 @kernel
 def touch(head, v):  # type: ignore[no-untyped-def]
-    """Mark a node for elimination in the next iteration; the caller has logged its row."""
+    """Log a node, which may be changed then, and mark it for elimination in the next iteration."""
+    transaction_log.log_node(head, v)
     nodes, touched = tb.nodes(head), tb.touched(head)
     if nodes[v].touched == 0:
         nodes[v].touched = 1
