@@ -24,6 +24,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph_update import Gone
+from pose_graph_ros.core.graph.pools import separator
 from pose_graph_ros.core.graph.rows import touch
 
 # Results of `add_rows`.
@@ -31,27 +32,24 @@ ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
 NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
-
 _POSE = int(NodeKind.POSE)
+
 
 @kernel
 def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
     """Tell whether a clique that one end of a factor is frontal in has all its ends."""
-    ends, n_ends = tb.factors(head)[e].ends, 0
-    for end in ends:
-        n_ends += end >= 0
-    for end in ends:
+    ends = tb.factors(head)[e].ends
+    i, j, k = ends[0], ends[1], ends[2]
+    for end in (i, j, k):
         if end < 0:
             continue
-        c, n = tb.nodes(head)[end].clique, 0
+        c = tb.nodes(head)[end].clique
         if c < 0:
             return False
         clique = tb.cliques(head)[c]
         n_nodes = clique.n_frontal + clique.n_separator
-        for v in tb.pool_i(head)[clique.members:clique.members + n_nodes]:
-            if v == ends[0] or v == ends[1] or v == ends[2]:
-                n += 1
-        if n == n_ends:
+        members = tb.pool_i(head)[clique.members:clique.members + n_nodes]
+        if i in members and (j < 0 or j in members) and (k < 0 or k in members):
             return True
     return False
 
@@ -135,9 +133,9 @@ def set_fixed(head, chosen, fixed):  # type: ignore[no-untyped-def]
     """Fix hidden nodes, by row, at their present poses, or free them."""
     nodes = tb.nodes(head)
     for v in chosen:
-            nodes[v].fixed = 1 if fixed else 0
         if (nodes[v].fixed != 0) != fixed:
             touch(head, v)
+            nodes[v].fixed = 1 if fixed else 0
 
 
 def find_ends(memory: tb.Memory) -> None:
@@ -205,7 +203,7 @@ def restart(head):  # type: ignore[no-untyped-def]
     settle(head)
 
 
-@kernel(signature=(tb.HEAD,))
+@kernel(signature=(tb.HEAD,), allocates=True)
 def settle(head):  # type: ignore[no-untyped-def]
     """
     Evaluate all factors and bring the tables into the state after a step of the smoother.
@@ -226,10 +224,9 @@ def settle(head):  # type: ignore[no-untyped-def]
             chi2 += f.energy
             error2 += f.error2
     scalars.chi2 = chi2
-    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
-        if prior_rows.is_prior(head, c):
-            tb.cliques(head)[c].energy = 0.0
-            prior_rows.update_energy(head, c)
+    for c in prior_rows.all_priors(head):
+        tb.cliques(head)[c].energy = 0.0
+        prior_rows.update_energy(head, c)
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
     if not 0.0 < scalars.budget < error2:
         return
@@ -259,11 +256,8 @@ def touch_with(head, v, spared):  # type: ignore[no-untyped-def]
         depth -= 1
         c = cliques[stack[depth]].child
         while c >= 0:
-            if (cliques[c].n_frontal > 0 and not spared[c]
-                    and prior_rows.is_in_separator(head, c, v)):
-                other = tb.pool_i(head)[cliques[c].members]
-                transaction_log.log_node(head, other)
-                touch(head, other)
+            if cliques[c].n_frontal > 0 and not spared[c] and v in separator(head, c):
+                touch(head, tb.pool_i(head)[cliques[c].members])
                 stack[depth] = c
                 depth += 1
             c = cliques[c].sibling

@@ -397,8 +397,7 @@ class Graph:
 
     def commit(self) -> Gone:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
-        if self.memory.head[tb.LOG_END] > 0:  # else a step has done so
-            transaction_log.commit(self.memory.head)
+        transaction_log.commit(self.memory.head)
         self._updating = False
         return editing.compact(self.memory)
 

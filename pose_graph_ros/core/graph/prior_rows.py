@@ -157,26 +157,15 @@ def diagonal(head, c, k):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def is_in_separator(head, c, v):  # type: ignore[no-untyped-def]
-    """Tell whether a node is in the separator of a clique; a prior is nothing else."""
-    found = False
-    for u in pools.separator(head, c):
-        found = found or u == v
-    return found
-
-
-@kernel
 def weakest(head, c, v):  # type: ignore[no-untyped-def]
     """Return the information of a prior on a node in its weakest direction."""
-    pool_f, nodes, at = tb.pool_f(head), pools.separator(head, c), tb.cliques(head)[c].values
+    nodes, update = pools.separator(head, c), pools.update_matrix(head, c)
     n = 3 * len(nodes)
     for k in range(len(nodes)):
         if nodes[k] == v:
             i = 3 * k
-            x, y, th = (at + row_start(i, n) + i, at + row_start(i + 1, n) + i,
-                        at + row_start(i + 2, n) + i)
-            return weakest_of(pool_f[x], pool_f[x + 1], pool_f[x + 2], pool_f[y + 1],
-                              pool_f[y + 2], pool_f[th + 2])
+            x, y = update[row_start(i, n) + i:], update[row_start(i + 1, n) + i:]
+            return weakest_of(x[0], x[1], x[2], y[1], y[2], update[row_start(i + 2, n) + i + 2])
     return 0.0, 0.0
 
 
@@ -268,12 +257,12 @@ def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
     _touch_nodes(head, c, 1.0)
 
 
-@kernel
+@kernel(allocates=True)
 def remove_of_node(head, v):  # type: ignore[no-untyped-def]
     """Take all priors on a node out of the graph."""
     cliques = tb.cliques(head)
-    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
-        if not is_prior(head, c) or not is_in_separator(head, c, v):
+    for c in all_priors(head):
+        if v not in pools.separator(head, c):
             continue
         transaction_log.log_clique(head, c)
         _touch_nodes(head, c, -1.0)

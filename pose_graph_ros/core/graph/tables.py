@@ -208,8 +208,6 @@ HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 # Capacity of a new table [rows]; rows never written to take no memory.
 FIRST_ROWS: Final = 4096
 
-IntHead = npt.NDArray[np.int64]
-
 
 def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
     """
@@ -278,7 +276,7 @@ class Memory:
     """Owns the tables and the head of one graph, which is interrupted with that of another."""
 
     def __init__(self, another: 'Memory | None' = None) -> None:
-        self.head: IntHead = np.zeros(HEAD_SIZE, dtype=np.int64)
+        self.head = np.zeros(HEAD_SIZE, dtype=np.int64)
         self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[FIXED] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}

@@ -174,7 +174,7 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
     must grow to `NEED_F` and `NEED_I` of the head. No node may be touched.
     """
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    waiting, scalars = tb.waiting(head), tb.scalars(head)[0]
+    scalars = tb.scalars(head)[0]
     whole, leaves = _whole(head, leaving)
     tops = np.empty(len(leaving), np.int32)
     n_tops, need_f, need_i = 0, head[tb.POOL_F_END], head[tb.POOL_I_END]
@@ -206,12 +206,6 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
             _turn_into_prior(head, tops[t], energy)
         else:
             transaction_log.give_clique(head, tops[t])
-    kept = 0    # those of the waiting that have still a weight
-    for n in range(head[tb.N_WAITING]):
-        if tb.factors(head)[waiting[n]].weight > 0.0:
-            waiting[kept] = waiting[n]
-            kept += 1
-    head[tb.N_WAITING] = kept
     head[tb.N_TURNED] = 0
     head[tb.LOG_END] = 0
     return DONE
