@@ -13,7 +13,6 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 
-_SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
 # The pools pool_f and pool_i, by where the head has their ends and free lists.
 VALUES: Final = (tb.POOL_F_END, tb.FREE_F)
 NODES: Final = (tb.POOL_I_END, tb.FREE_I)
@@ -83,43 +82,42 @@ def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _size_class(n):  # type: ignore[no-untyped-def]
-    """Return the smallest size class (index in `SIZES`) whose blocks hold n numbers."""
-    if n <= 64:
-        return n
-    # not `np.searchsorted`, with which Numba loads its linear algebra and that of SciPy
-    low, high = 64, len(_SIZES) - 1
-    while low < high:
-        middle = (low + high) // 2
-        if _SIZES[middle] < n:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def _block(n):  # type: ignore[no-untyped-def]
+    """
+    Return which free list the block for n numbers is in, and its size.
+
+    Sizes are exact up to 64 numbers, and grow in steps of an eighth from there on.
+    """
+    number = size = min(n, 64)
+    while size < n:
+        number, size = number + 1, size + (size + 7) // 8
+    return number, size
 
 
 @kernel
 def rounded(n):  # type: ignore[no-untyped-def]
     """Return the size of the block that n numbers take from a pool."""
-    return _SIZES[_size_class(n)]
+    _, size = _block(n)
+    return size
 
 
 @kernel
 def take(head, pool, n):  # type: ignore[no-untyped-def]
     """Take a block for n numbers from NODES or VALUES, which has room, and return its index."""
-    (end, free), size = pool, _size_class(n)
-    at = head[free + size]
+    (end, free), (number, size) = pool, _block(n)
+    at = head[free + number]
     if at < 0:
-        head[end] += _SIZES[size]
-        return head[end] - _SIZES[size]
-    head[free + size] = tb.pool_i(head)[at] if pool == NODES else np.int64(tb.pool_f(head)[at])
+        head[end] += size
+        return head[end] - size
+    head[free + number] = tb.pool_i(head)[at] if pool == NODES else np.int64(tb.pool_f(head)[at])
     return at
 
 
 @kernel
 def give(head, pool, at, n):  # type: ignore[no-untyped-def]
     """Give a block of n numbers back to NODES or VALUES: put it into the list of its size."""
-    free = pool[1] + _size_class(n)
+    number, _ = _block(n)
+    free = pool[1] + number
     if pool == NODES:
         tb.pool_i(head)[at] = head[free]
     else:

@@ -196,11 +196,8 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
  NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
  N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
  REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 41)
-# Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
-SIZES: Final = [*range(65)]
-while SIZES[-1] < 2**31:
-    SIZES.append(int(np.ceil(1.125 * SIZES[-1])))
-N_SIZES: Final = len(SIZES)
+# Number of sizes of blocks in the pools, the largest of which have 2**31 numbers.
+N_SIZES: Final = 212
 # Heads of the free lists of pool_f and pool_i, one for each size.
 FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES

@@ -23,11 +23,11 @@ def begun(seed: int) -> tuple[World, IncrementalSmoother, SlowGraph]:
 
 def free_blocks(graph: Graph, heads: int, pool: np.ndarray) -> list[tuple[int, int]]:
     """Return the blocks (begin, size) of the free lists of a pool."""
-    blocks = []
-    for size, first in enumerate(graph.memory.head[heads:heads + tb.N_SIZES].tolist()):
-        at = first
+    blocks, size = [], -1
+    for first in graph.memory.head[heads:heads + tb.N_SIZES].tolist():
+        at, size = first, int(pools.rounded(size + 1))
         while at >= 0:
-            blocks.append((at, tb.SIZES[size]))
+            blocks.append((at, size))
             at = int(pool[at])
     return blocks
 
