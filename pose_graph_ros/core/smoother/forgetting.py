@@ -25,22 +25,13 @@ from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_ME
 @kernel(allocates=True)
 def _whole(head, leaving):  # type: ignore[no-untyped-def]
     """Tell of which cliques all nodes at and below leave, and which of all nodes leave."""
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    leaves, whole = np.zeros(head[tb.N_NODES], np.bool_), np.zeros(head[tb.N_CLIQUES], np.bool_)
+    leaves, whole = np.zeros(head[tb.N_NODES], np.bool_), np.ones(head[tb.N_CLIQUES], np.bool_)
     for v in leaving:
         leaves[v] = True
-    for v in leaving:   # first of the nodes in a clique alone
-        row, whole[nodes[v].clique] = cliques[nodes[v].clique], True
-        for u in pool_i[row.members:row.members + row.n_frontal]:
-            whole[nodes[v].clique] &= leaves[u]
-    for v in leaving:   # one that has another below it is not whole, nor is what is above it
-        c, all_below = nodes[v].clique, True
-        child = cliques[c].child
-        while child >= 0:
-            all_below &= whole[child] or cliques[child].n_frontal == 0
-            child = cliques[child].sibling
-        while not all_below and c >= 0 and whole[c]:
-            whole[c], c = False, cliques[c].parent
+    for v in range(len(leaves)):
+        c = -1 if leaves[v] else tb.nodes(head)[v].clique
+        while c >= 0 and whole[c]:
+            whole[c], c = False, tb.cliques(head)[c].parent
     return whole, leaves
 
 
