@@ -17,7 +17,6 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import OdometrySample, Position
 from pose_graph_ros.core.smoother import trial as trials
-from pose_graph_ros.core.smoother.trial import Trial
 
 SECOND = 10**9
 SIGMA = 0.3
@@ -43,11 +42,9 @@ def test_all_is_solved_for_now_and_then_where_every_update_diverges(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     solved = []
-    whole, trial = trials.optimize_copy, Trial.__init__
-    monkeypatch.setattr(trials, 'optimize_copy', lambda copy, rows, leaving: (
-        solved.append(len(rows.poses)), whole(copy, rows, leaving))[1])
-    monkeypatch.setattr(Trial, '__init__', lambda self, graph, *rest: (
-        solved.append(graph.n_nodes), trial(self, graph, *rest))[1])
+    whole = trials.solved
+    monkeypatch.setattr(trials, 'solved', lambda copy, rows, *rest: (
+        solved.append(len(rows.poses)), whole(copy, rows, *rest))[1])
     # with odometry that is believed so little every direction is possible
     backend = PoseGraphBackend(BackendConfig(
         odometry={'odom': OdometrySource(sigma_scale=8.0)},

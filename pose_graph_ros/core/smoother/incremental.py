@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import chi2_of, Status
+from pose_graph_ros.core.batch.optimizer import chi2_of, Status, to_the_end
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError, INTERRUPTED
 from pose_graph_ros.core.geometry import se2
@@ -372,7 +372,8 @@ class IncrementalSmoother:
         This is done on a copy with the update, which replaces the graph on success.
         """
         other = IncrementalSmoother(self._config, Graph(self.graph))
-        if trial.optimize_copy(other.graph, self.graph.rows(), update):
+        solved = to_the_end(trial.solved(other.graph, self.graph.rows(), update))
+        if solved.status is not Status.FAILED:
             result = other._eliminate()
             if result.status is not Status.FAILED:
                 self._memory.take(other.graph.memory)

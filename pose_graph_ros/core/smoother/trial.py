@@ -5,7 +5,7 @@ The batch optimiser on copies of the graph: for a step that diverges, and for tr
 
 Gauss-Newton converges from a good estimate. A loop closure that contradicts the estimate by
 radians, over a part of the graph with little information, can make it diverge. That is rare and
-detected at once, so steps are not damped. `optimize_copy` begins at a linear start, and begins
+detected at once, so steps are not damped. `solved` begins at a linear start, and begins
 again at the poses before the step if the result has a higher chi2 than these. The minimum that it
 finds is better than the result of a damped step, at the cost of a few steps.
 
@@ -18,7 +18,7 @@ with the graph, and adopted by the smoother with all that was added meanwhile
 (`IncrementalSmoother.adopt`); or it is dropped, without a trace.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,15 +41,16 @@ _CONFIG = SolverConfig(max_iterations=optimizer.TRUSTED_ITERATIONS, step_toleran
 _STARTS = (Start.CHORDAL, Start.PRESENT)
 
 
-def optimize_copy(copy: Graph, rows: GraphRows, update: GraphUpdate) -> bool:
-    """Return whether the batch optimiser finds a solution for a copy with an update."""
+def solved(copy: Graph, rows: GraphRows, update: GraphUpdate, config: SolverConfig = _OF_STEP,
+           starts: Sequence[Start] = _STARTS_OF_STEP) -> Optimization:
+    """Optimise a copy, empty at first, with an update; it pauses at each iteration."""
     copy.fill(rows)
     copy.apply(update)
-    result = optimizer.optimize(copy, _OF_STEP, _STARTS_OF_STEP)
-    if result.status is Status.FAILED:
-        return False
+    yield
+    result = yield from optimizer.in_parts(copy, config, starts)
+    yield
     copy.set_poses(copy.poses)
-    return True
+    return result
 
 
 class Trial:
@@ -83,13 +84,10 @@ class Trial:
 
     def _optimization(self, copy: Graph) -> Optimization:
         rows, start = self._before, self._start
-        copy.fill(rows if start is None else rows._replace(poses=start))
-        copy.apply(self._update)
-        yield
-        result = yield from optimizer.in_parts(
-            copy, _CONFIG, _STARTS if start is None else (Start.PRESENT,))
-        yield
-        copy.set_poses(copy.poses)
+        if start is not None:
+            rows = rows._replace(poses=start)
+        result = yield from solved(copy, rows, self._update, _CONFIG,
+                                   _STARTS if start is None else (Start.PRESENT,))
         # from poses of a solution it needs few iterations, if any number of them is enough
         all_used = start is not None and result.iterations == _CONFIG.max_iterations
         if result.status is Status.CONVERGED and not all_used and self._eliminate():
