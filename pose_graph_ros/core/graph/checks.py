@@ -33,11 +33,6 @@ class Ids(NamedTuple):
     end: int                            # id of the next new row
     present: IntArray | None = None     # by row, ascending; None where they are 0..end - 1
 
-    @classmethod
-    def of(cls, end: int, present: IntArray) -> 'Ids':
-        """Return the ids of a table."""
-        return cls(end, None if len(present) == end else present)
-
     def rows(self, ids: npt.ArrayLike) -> IntArray:
         """Return the row of each id, in the shape of `ids`, -1 where it is in none."""
         wanted = np.asarray(ids, dtype=np.int64)

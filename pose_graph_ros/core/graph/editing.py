@@ -82,18 +82,18 @@ def weigh(head, e, weight):  # type: ignore[no-untyped-def]
     transaction_log.log_factor(head, e)
     if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
         head[tb.STRUCTURE] = 1
-    for v in f.ends:
-        if v >= 0:
-            touch(head, v)
+    for side in range(3):
+        v = f.ends[side]
+        if v < 0:
+            continue
+        touch(head, v)
+        if weight == 0.0:
+            unlink(head, e, side)
+        elif before == 0.0:     # put it at the head of the list
+            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
     rows.scale_by(head, e, weight - before)
     tb.scalars(head)[0].chi2 -= f.energy
     f.weight = weight
-    for side in range(3):
-        v = f.ends[side]
-        if v >= 0 and weight == 0.0:
-            unlink(head, e, side)
-        elif v >= 0 and before == 0.0:  # put it at the head of the list
-            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
     f.error2 = f.energy = 0.0
     if weight > 0.0:
         factors.linearize(head, e)

@@ -98,7 +98,7 @@ class Graph:
 
     def _ids(self, table: str) -> Ids:
         n_rows, next_id = (int(self.memory.head[k]) for k in COUNTERS[table])
-        return Ids.of(next_id, self.memory[f'{table}_id'][:n_rows])
+        return Ids(next_id, None if n_rows == next_id else self.memory[f'{table}_id'][:n_rows])
 
     @property
     def node_ids(self) -> IntArray:

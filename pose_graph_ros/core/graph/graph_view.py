@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Points
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 
@@ -73,22 +73,22 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
         # `take` is several times as fast as an index
         return Lines(positions.take(ends[rows, :2], axis=0), sigmas[rows])
 
-    in_graph = table.weights > 0.0
+    in_graph, tells_position = table.weights > 0.0, table.records['information'][:, 0] > 0.0
+    used = in_graph & tells_position
     weak, waiting, doubted, unused = (
         rows[rows >= 0] for part in drawn
         for rows in (graph.factor_rows(np.array(part, dtype=np.int64)),))
     in_graph[weak] = in_graph[doubted] = False
     # a measurement with a time-correlated error is an edge to a bias
     in_map = np.flatnonzero(
-        ((kinds == FactorKind.BIAS) | (ends[:, 1] < 0)) & table.tells_position
-        & ~is_bias[ends[:, 0]])
+        ((kinds == FactorKind.BIAS) | (ends[:, 1] < 0)) & used & ~is_bias[ends[:, 0]])
     return GraphView(
         nodes=positions.take(np.flatnonzero(~is_bias), axis=0),
         odometry=lines(np.flatnonzero(in_graph & (kinds == FactorKind.ODOMETRY))),
         loop_closures=lines(np.flatnonzero(in_graph & (kinds == FactorKind.LOOP_CLOSURE))),
         observed=_measured(graph, table, in_map), weak=lines(weak),
         waiting=lines(waiting), doubted=lines(doubted),
-        unused=_measured(graph, table, unused[table.records['information'][unused, 0] > 0.0]))
+        unused=_measured(graph, table, unused[tells_position[unused]]))
 
 
 def _measured(graph: Graph, table: 'FactorTable', rows: IntArray) -> Lines:
@@ -109,11 +109,6 @@ class FactorTable(NamedTuple):
     def weights(self) -> FloatArray:
         """What the information is multiplied by."""
         return np.asarray(self.records['weight'])
-
-    @property
-    def tells_position(self) -> BoolArray:
-        """Whether factors measure a position and are not removed."""
-        return (self.records['information'][:, 0] > 0.0) & (self.weights > 0.0)
 
     @property
     def sigmas(self) -> FloatArray:

@@ -174,20 +174,13 @@ def commit(head):  # type: ignore[no-untyped-def]
     head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
-@kernel
-def _entry(head, end):  # type: ignore[no-untyped-def]
-    """Return where the words of the entry that ends at an index begin, its row and its kind."""
-    log = tb.log(head)
-    row, kind = log[end - 2], log[end - 1]
-    return end - 2 - len(_words(head, kind, row)), row, kind
-
-
 @kernel(signature=(tb.HEAD,))
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all that was logged since `begin`, the newest entry first."""
     log, pool_f, end = tb.log(head), tb.pool_f(head), head[tb.LOG_END]
     while end > 0:
-        end, at, kind = _entry(head, end)
+        at, kind = log[end - 2], log[end - 1]
+        end -= 2 + len(_words(head, kind, at))
         if kind == TAKEN_CLIQUE:
             if tb.cliques(head)[at].n_frontal >= 0:     # else the same update has given it back
                 give_clique(head, at)
@@ -212,7 +205,8 @@ def largest_move(head):  # type: ignore[no-untyped-def]
     """Return by how much the update has moved poses: the largest change of a coordinate [m]."""
     nodes, log, end, largest = tb.nodes(head), tb.log(head), head[tb.LOG_END], 0.0
     while end > 0 and log[end - 1] != COUNTERS:
-        end, row, kind = _entry(head, end)
+        row, kind = log[end - 2], log[end - 1]
+        end -= 2 + len(_words(head, kind, row))
         if kind == NODE and nodes[row].kind == _POSE:
             for k in range(2):
                 largest = max(largest, abs(nodes[row].pose[k] - tb.log_numbers(head)[end + k]))
