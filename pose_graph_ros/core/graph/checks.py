@@ -106,11 +106,8 @@ def check(table: Factors, kind: npt.NDArray[Any], dimension: IntArray | None = N
                  'error or the node has not', diagonal)
     skew = np.max(np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
     _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, 'Factors.information is not symmetric', matrix)
-    smallest = np.zeros(len(matrix))
-    doubtful = ~are_definite(matrix)
-    smallest[doubtful] = np.min(np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
-    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
-    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
+    semidefinite = np.all(diagonal >= 0.0, axis=1) & are_definite(matrix, SEMIDEFINITE_TOLERANCE)
+    _refuse_rows(~semidefinite | ~np.any(matrix, axis=(1, 2)),
                  'Factors.information is not positive semidefinite, or zero', matrix)
 
 
@@ -127,15 +124,19 @@ def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
                          f'{expected} for this end', node)
 
 
-def are_definite(information: FloatArray) -> BoolArray:
-    """Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit."""
+def are_definite(information: FloatArray, tolerance: float = -1e-9) -> BoolArray:
+    """
+    Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit.
+
+    That is, with the diagonal scaled to 1 their eigenvalues plus the tolerance are.
+    """
     correlation = scaled(information)
     a, b, c = correlation[:, 0, 1], correlation[:, 0, 2], correlation[:, 1, 2]
-    diagonal = np.diagonal(correlation, axis1=1, axis2=2)
-    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
+    x, y, z = np.diagonal(correlation, axis1=1, axis2=2).T + tolerance
     # the leading minors
-    return np.asarray(np.all(np.abs(diagonal - 1.0) < 1e-12, axis=1)
-                      & (1.0 - a * a > 1e-9) & (determinant > 1e-9))
+    minor = x * y - a * a
+    determinant = z * minor + 2.0 * a * b * c - y * b * b - x * c * c
+    return np.asarray((x > 0.0) & (minor > 0.0) & (determinant > 0.0))
 
 
 def _refuse_rows(bad: BoolArray, reason: str, values: npt.NDArray[np.generic]) -> None:

@@ -286,14 +286,11 @@ def remove_of_node(head, v):  # type: ignore[no-untyped-def]
 
 def add_priors(memory: tb.Memory, priors: Sequence[Prior], rows: Sequence[IntArray]) -> None:
     """Add priors to the graph, within an update; the other tables have room for them."""
-    head, values = memory.head, [packed(prior) for prior in priors]
-    # a block of a pool is up to an eighth larger than what is in it; r is kept twice
-    for name, end, sizes in (
-            ('pool_f', tb.POOL_F_END, [len(numbers) + 6 * len(nodes) for numbers, nodes in zip(
-                values, rows, strict=True)]),
-            ('pool_i', tb.POOL_I_END, list(map(len, rows)))):
-        room = int(head[end]) + sum(size + size // 8 + 1 for size in sizes)
-        memory.ensure(name, room, keep=int(head[end]))
+    head, values, n = memory.head, [packed(prior) for prior in priors], sum(map(len, rows))
+    # a block of a pool is at most twice as large as what is in it; r is kept twice
+    for name, end, size in (('pool_f', tb.POOL_F_END, sum(map(len, values)) + 6 * n),
+                            ('pool_i', tb.POOL_I_END, n)):
+        memory.ensure(name, int(head[end]) + 2 * size, keep=int(head[end]))
     memory.ensure('work_f', 15 * max(map(len, rows)))   # what elimination needs for each node
     for prior, numbers, nodes in zip(priors, values, rows, strict=True):
         add(head, nodes, numbers, prior.anchored)
