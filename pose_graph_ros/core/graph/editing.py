@@ -63,13 +63,10 @@ def unlink(head, e, side):  # type: ignore[no-untyped-def]
     if at == 4 * e + side:
         node.factor_list = after
         return
-    while True:
-        f, link = factors[at >> 2], at & 3
-        if f.next[link] == 4 * e + side:
-            transaction_log.log_factor(head, at >> 2)
-            f.next[link] = after
-            return
-        at = f.next[link]
+    while factors[at >> 2].next[at & 3] != 4 * e + side:
+        at = factors[at >> 2].next[at & 3]
+    transaction_log.log_factor(head, at >> 2)
+    factors[at >> 2].next[at & 3] = after
 
 
 @kernel

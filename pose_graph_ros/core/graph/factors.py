@@ -32,8 +32,7 @@ without a position. All of them are, turned into map axes by the rotation R of t
     R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + constant
 
 for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type says of its
-Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotation by th_i enters,
-which is given as (c, s).
+Jacobians; with them `R e_t = d + constant`.
 
 Solvers need the linearization of a factor, its linearization error, and its energy. The
 unknown of a node is its pose minus a constant reference, delta = x - x_ref, in map axes.
@@ -116,16 +115,6 @@ def prepare(f, kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
-    """Return cosine and sine of what an error needs of th_i: th_i + th_z, or th_i."""
-    if is_relative(kind):
-        heading += f.mean[2]
-    elif f.constants[0] == 0.0 and f.constants[1] == 0.0:
-        return 1.0, 0.0     # no arm
-    return math.cos(heading), math.sin(heading)
-
-
-@kernel(forceinline=True)
 def kind_and_ends(f):  # type: ignore[no-untyped-def]
     """Return kind and ends i, j, k of a factor; i = j where a node is observed."""
     i, j = f.ends[0], f.ends[1]
@@ -185,13 +174,16 @@ def motion(nodes, f):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
-    """Return the error e_t, cosine and sine of its frame, and its arm, for d and `rotation`."""
-    if is_relative(kind):
-        ex, ey = c * dx + s * dy - f.constants[0], c * dy - s * dx - f.constants[1]
-        return ex, ey, c, s, dx, dy
+def error(f, kind, dx, dy, heading):  # type: ignore[no-untyped-def]
+    """Return the error e_t, cosine and sine of its frame, and its arm, for d and th_i."""
     ox, oy = f.constants[0], f.constants[1]
-    ax, ay = c * ox - s * oy, s * ox + c * oy
+    if is_relative(kind):
+        c, s = math.cos(heading + f.mean[2]), math.sin(heading + f.mean[2])
+        return c * dx + s * dy - ox, c * dy - s * dx - oy, c, s, dx, dy
+    ax = ay = 0.0
+    if ox != 0.0 or oy != 0.0:
+        c, s = math.cos(heading), math.sin(heading)
+        ax, ay = c * ox - s * oy, s * ox + c * oy
     c, s = 1.0, 0.0
     if kind == RANGE:
         vx, vy = dx - ax, dy - ay
@@ -231,8 +223,8 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     `third` is what its third node adds.
     """
     ft, fth = factors_of_end(f, kind)
-    c, s = rotation(f, kind, start[2])
-    ex, ey, c, s, ax, ay = error(f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
+    dx, dy = ft * end[0] - start[0], ft * end[1] - start[1]
+    ex, ey, c, s, ax, ay = error(f, kind, dx, dy, start[2])
     offset = f.mean[2] if kind == BIAS else -f.mean[2]
     if kind >= OBSERVED:
         offset = f.mean[2] - f.constants[2]
@@ -287,13 +279,12 @@ def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
         ex, ey = ax - f.constants[0] + by_x, ay - f.constants[1] + by_y
         rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
-        c, s = rotation(f, kind, start.pose[2])
         kx, ky = constant(f, kind, c_bar, s_bar, bx, by)
         lx = c_bar * (dx + kx) + s_bar * (dy + ky)
         ly = c_bar * (dy + ky) - s_bar * (dx + kx)
         if bx == 0.0 and by == 0.0:
             turned = 0.0
-        ex, ey, c, s, ax, ay = error(f, kind, dx, dy, c, s)
+        ex, ey, c, s, ax, ay = error(f, kind, dx, dy, start.pose[2])
         rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
         turned += (c - c_bar) ** 2 + (s - s_bar) ** 2
     linear = f.lin_k + fth * end.delta[2] - th + delta_k
