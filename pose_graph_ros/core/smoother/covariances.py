@@ -161,7 +161,7 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
     """
     Write the covariances of all nodes into zeros of shape (N, 3, 3).
 
-    The sweep keeps a stack of cliques and a stack of their Z_ss.
+    The sweep keeps a stack of cliques and a stack of their Z_ss, in map axes.
     """
     nodes, pool_i = tb.nodes(head), tb.pool_i(head)
     cliques, blocks = np.empty(64, np.int32), np.empty(1024)
@@ -177,20 +177,17 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
             rows, rest = 3 * row.n_frontal, 3 * row.n_separator
             inverse = np.empty((rows + rest, rows + rest))
             end -= rest * rest
-            for i in range(rest):
-                for q in range(rest):
-                    inverse[rows + i, rows + q] = blocks[end + i * rest + q]
-            _invert_clique(head, row, inverse)
+            of_separator = blocks[end:end + rest * rest].reshape(rest, rest)
             turn = clique_frames.present_turn(head, c)
+            _rotate(of_separator, -turn)
+            inverse[rows:, rows:] = of_separator
+            _invert_clique(head, row, inverse)
+            _rotate(inverse, turn)
             for k in range(0, rows, 3):
                 block = out[pool_i[row.members + k // 3]]
                 for m in range(3):
-                    for q in range(3):
-                        block[m, q] = inverse[k + m, k + q]
-                if turn != 0.0:
-                    _rotate(block, turn)
-                    for i, j in ((1, 0), (2, 0), (2, 1)):   # exactly symmetric
-                        block[i, j] = block[j, i]
+                    for q in range(3):  # exactly symmetric
+                        block[m, q] = inverse[k + min(m, q), k + max(m, q)]
             for m in range(len(inverse) // 3):
                 nodes[pool_i[row.members + m]].index = 3 * m
             child = row.child
@@ -205,9 +202,6 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                         i = nodes[members[a // 3]].index + a % 3
                         for b in range(size):
                             below[a, b] = inverse[i, nodes[members[b // 3]].index + b % 3]
-                    turn_below = clique_frames.present_turn(head, child)
-                    if turn_below != turn:
-                        _rotate(below, turn - turn_below)
                     end += size * size
                     if depth == len(cliques):
                         cliques = grown(cliques, 0)
@@ -219,6 +213,8 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
 @kernel
 def _rotate(block, angle):  # type: ignore[no-untyped-def]
     """Rotate a covariance of nodes to axes in which angles are larger by `angle` [rad]."""
+    if angle == 0.0:
+        return
     cos, sin = math.cos(angle), math.sin(angle)
     for r in range(0, len(block), 3):
         for q in range(len(block)):
