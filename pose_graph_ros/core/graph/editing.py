@@ -32,7 +32,6 @@ ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
 NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
-_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -139,7 +138,7 @@ def find_ends(memory: tb.Memory) -> None:
     """Note the newest pose and the first fixed node, of those that do not leave."""
     nodes = memory['nodes'][:memory.head[tb.N_NODES]]
     stays = nodes['factor_list'] != tb.LEAVES
-    for counter, of_kind, place in ((tb.NEWEST, nodes['kind'] == np.uint8(_POSE), -1),
+    for counter, of_kind, place in ((tb.NEWEST, nodes['kind'] == np.uint8(NodeKind.POSE), -1),
                                     (tb.FIXED, nodes['fixed'] != 0, 0)):
         found = np.flatnonzero(stays & of_kind)
         memory.head[counter] = found[place] if len(found) > 0 else -1
@@ -172,7 +171,7 @@ def add_rows(head, values, types, records, checked):  # type: ignore[no-untyped-
         head[tb.NEXT_NODE] += 1
         touch(head, v)
         head[tb.STRUCTURE] = 1
-        if nodes[v].kind == _POSE:
+        if nodes[v].kind == NodeKind.POSE:
             head[tb.NEWEST] = v
     head[tb.N_FACTORS] = n_factors
     for e in range(n_factors - len(records), n_factors):

@@ -32,7 +32,6 @@ from pose_graph_ros.core.graph.transaction_log import copied
 
 # Parent of a prior that this update has removed.
 REMOVED = -2
-_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -48,7 +47,7 @@ def turns(head, c):  # type: ignore[no-untyped-def]
     if tb.cliques(head)[c].anchored == 0:
         return True
     for v in pools.separator(head, c):
-        if tb.nodes(head)[v].kind != _POSE:
+        if tb.nodes(head)[v].kind != NodeKind.POSE:
             return False
     return len(pools.separator(head, c)) > 1
 

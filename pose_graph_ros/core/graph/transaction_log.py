@@ -16,7 +16,6 @@ from pose_graph_ros.core.graph.constraints import NodeKind
 
 # Kinds of entries of the log, which are words, the row that these are of, and the kind.
 NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, WAITING, TOUCHED, SCALARS, COUNTERS = range(8)
-_POSE = int(NodeKind.POSE)
 
 
 def largest(n_nodes: int, n_factors: int) -> int:
@@ -207,7 +206,7 @@ def largest_move(head):  # type: ignore[no-untyped-def]
     while end > 0 and log[end - 1] != COUNTERS:
         row, kind = log[end - 2], log[end - 1]
         end -= 2 + len(_words(head, kind, row))
-        if kind == NODE and nodes[row].kind == _POSE:
+        if kind == NODE and nodes[row].kind == NodeKind.POSE:
             for k in range(2):
                 largest = max(largest, abs(nodes[row].pose[k] - tb.log_numbers(head)[end + k]))
     return largest
