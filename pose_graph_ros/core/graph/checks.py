@@ -208,8 +208,7 @@ def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
 
 def check_weights(weights: Mapping[int, float]) -> None:
     """Raise unless new weights are valid."""
-    numbers = np.fromiter(weights.values(), np.float64, len(weights))
-    if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
-        number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
-        raise GraphUpdateError(f'weigh: expected a finite weight that is not negative, got '
-                               f'{weight} for number {number}')
+    for number, weight in weights.items():
+        if not 0.0 <= weight < np.inf:
+            raise GraphUpdateError(f'weigh: expected a finite weight that is not negative, got '
+                                   f'{weight} for number {number}')
