@@ -159,10 +159,6 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
     return array
 
 
-# Types of some new biases, to save making them.
-_BIASES = np.full(64, NodeKind.BIAS, np.uint8)
-
-
 def new_nodes(update: GraphUpdate) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
     """
     Return values, shape (N, 3), and types of new nodes.
@@ -172,10 +168,11 @@ def new_nodes(update: GraphUpdate) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
     """
     hidden, _, biases, dimensions, landmarks = update[:5]
     n = len(biases)
-    if n == len(landmarks) == 0:
-        return hidden, np.zeros(len(hidden), np.uint8)
-    if len(hidden) == len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
-        return biases, _BIASES[:n]
+    if len(landmarks) == len(dimensions) == 0:
+        if n == 0:
+            return hidden, np.zeros(len(hidden), np.uint8)
+        if len(hidden) == 0:
+            return biases, np.full(n, int(NodeKind.BIAS), np.uint8)
     hidden, biases = checked_poses('hidden', hidden), checked_poses('biases', biases)
     points = np.asarray(landmarks, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
