@@ -19,6 +19,7 @@ from benchmark.section import about, Options, Section
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.compiled.jit import INDICES, kernel
 from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.rows import forget_touched
 from pose_graph_ros.core.smoother import step, tree_update
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
@@ -64,7 +65,7 @@ class Phased(IncrementalSmoother):
         self.seconds[phase] += time.perf_counter() - begin
         return result
 
-    def _step(self, entered: int, *, fall_back: bool = True) -> UpdateResult:
+    def _step(self, entered: int, again: GraphUpdate | None = None) -> UpdateResult:
         head, timed = self._memory.head, self._timed
         head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = head[tb.N_TURNED] = 0
         head[tb.HEEDS] = tb.ALL

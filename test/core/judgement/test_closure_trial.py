@@ -52,9 +52,9 @@ class Counting(IncrementalSmoother):
         self.gates += len(edges)
         return super().innovations(edges)
 
-    def _fall_back_to_batch(self) -> UpdateResult:
+    def _fall_back_to_batch(self, update: GraphUpdate) -> UpdateResult:
         self.fallbacks += 1
-        return super()._fall_back_to_batch()
+        return super()._fall_back_to_batch(update)
 
 
 class Stuck(Counting):
