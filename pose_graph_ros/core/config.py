@@ -314,10 +314,11 @@ class SmootherConfig(Settings):
     POSITIVE = ('max_iterations',)
 
     alpha: float = 0.035  # back-substitution stops at nodes that move by less than this [sigma]
-    # upper limit of the squared linearisation error that a step may leave [sigma^2]
-    budget: float = 0.003
+    # Squared linearization error from which on the next step reduces what a step has left; of more
+    # than ten times as much, the step itself does so [sigma^2].
+    budget: float = 0.002
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
-    budget_share: float = 3e-5
+    budget_share: float = 2e-5
     max_iterations: int = 5  # maximum number of iterations per update; the next update continues
 
 

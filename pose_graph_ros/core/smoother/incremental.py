@@ -27,7 +27,7 @@ DIVERGED = 'the iterations diverge'
 class UpdateResult(NamedTuple):
     """Status and statistics of an update."""
 
-    # CONVERGED; MAX_ITERATIONS if linearization errors above the budget remain for the next
+    # CONVERGED; MAX_ITERATIONS if linearization errors above ten budgets remain for the next
     # update; FAILED if the update was rolled back
     status: Status
     reason: str     # of a failure, else empty

@@ -16,7 +16,7 @@ call of `refine` does one iteration, and the graph is valid after each.
 After a solve the factors of nodes that have turned are checked, and so are the frames of cliques
 that have turned against their parents' frames. If their squared linearization errors add up to
 more than the budget of the step, the largest of them are linearized again, and their nodes are
-touched for the next iteration: fluid relinearization (M. Kaess et al., "iSAM2", IJRR 2012), here
+touched for the next iteration, or for the next step if they are within `LEFT_OVER` budgets: fluid relinearization (M. Kaess et al., "iSAM2", IJRR 2012), here
 with whitened errors.
 """
 
@@ -34,6 +34,9 @@ from pose_graph_ros.core.smoother.back_substitution import back_substitute
 FIRST, RESUMED, AFTER_BATCH = range(3)
 # Sum of the squared linearization errors at the end of a refinement [sigma^2].
 ENOUGH = 1e-10
+# Number of budgets that a step may leave to the next one, which linearizes the factors again that it
+# eliminates anyway.
+LEFT_OVER = 10.0
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
 SHARE = 1e-13
@@ -44,7 +47,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
     Return DONE once the estimate is up to date with all touched nodes and waiting constraints.
 
-    UNFINISHED: linearization errors above the budget wait for the next update. After MORE_MEMORY
+    UNFINISHED: linearization errors above `LEFT_OVER` budgets wait for the next update. After MORE_MEMORY
     the step is entered again as RESUMED (AFTER_BATCH if it was that before).
     """
     scalars = tb.scalars(head)[0]
@@ -79,9 +82,10 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         error2 = _solve_and_check(head)
         if tree_update.interrupted(head):
             return tree_update.INTERRUPTED
-        settled = error2 <= budget(head)
-        if settled:
+        settled = error2 <= LEFT_OVER * budget(head)
+        if error2 <= budget(head):
             _forget_waiting(head)
+        if settled:
             break
         # The iterations have diverged if the error is large, in sigma^2 and against the lowest
         # chi2 of the step (a false constraint raises chi2 and all errors with it), and either no

@@ -75,7 +75,7 @@ def test_a_refinement_ends_at_the_batch_optimum(seed: int, observed: bool) -> No
     refined(smoother)
     excess, worst = off(smoother)
     # an update may leave 0.02 in what it moves; elsewhere earlier ones have left some
-    assert 1e-5 < before[0] < 0.05
+    assert 1e-5 < before[0] < 0.1
     assert abs(excess) < 1e-6
     assert worst < 1e-3
     assert worst < 0.1 * before[1]
