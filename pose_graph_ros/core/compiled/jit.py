@@ -33,7 +33,7 @@ Function = Callable[..., Any]
 # Options of `numba.njit` for all kernels. All are explicit: a kernel inherits a missing option
 # from the caller that it is first compiled for, so its code would depend on the order of calls.
 OPTIONS = MappingProxyType({
-    'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, 'fastmath': False})
+    'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, 'fastmath': {'contract'}})
 # Numba's run time counts references to arrays, which took a fifth of the computing time. OWNS is
 # for kernels that allocate arrays, BORROWS for all others.
 OWNS = MappingProxyType({'_nrt': True})
