@@ -16,8 +16,8 @@ call of `refine` does one iteration, and the graph is valid after each.
 After a solve the factors of nodes that have turned are checked, and so are the frames of cliques
 that have turned against their parents' frames. If their squared linearization errors add up to
 more than the budget of the step, the largest of them are linearized again, and their nodes are
-touched for the next iteration, or for the next step if they are within `LEFT_OVER` budgets: fluid relinearization (M. Kaess et al., "iSAM2", IJRR 2012), here
-with whitened errors.
+touched: for the next iteration, or for the next step if they are within `LEFT_OVER` budgets. This
+is fluid relinearization (M. Kaess et al., "iSAM2", IJRR 2012), here with whitened errors.
 """
 
 import math
@@ -34,8 +34,8 @@ from pose_graph_ros.core.smoother.back_substitution import back_substitute
 FIRST, RESUMED, AFTER_BATCH = range(3)
 # Sum of the squared linearization errors at the end of a refinement [sigma^2].
 ENOUGH = 1e-10
-# Number of budgets that a step may leave to the next one, which linearizes the factors again that it
-# eliminates anyway.
+# Number of budgets that a step may leave to the next one, which eliminates most of the same cliques
+# anyway.
 LEFT_OVER = 10.0
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
@@ -47,8 +47,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
     Return DONE once the estimate is up to date with all touched nodes and waiting constraints.
 
-    UNFINISHED: linearization errors above `LEFT_OVER` budgets wait for the next update. After MORE_MEMORY
-    the step is entered again as RESUMED (AFTER_BATCH if it was that before).
+    UNFINISHED: linearization errors above `LEFT_OVER` budgets wait for the next update. After
+    MORE_MEMORY the step is entered again as RESUMED (AFTER_BATCH if it was that before).
     """
     scalars = tb.scalars(head)[0]
     if entered == FIRST:
