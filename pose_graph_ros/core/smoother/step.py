@@ -34,7 +34,7 @@ from pose_graph_ros.core.smoother.back_substitution import back_substitute
 FIRST, RESUMED, AFTER_BATCH = range(3)
 # Sum of the squared linearization errors at the end of a refinement [sigma^2].
 ENOUGH = 1e-10
-# Number of budgets that a step may leave to the next one, which eliminates most of the same cliques
+# Number of budgets that a step may leave to the next one, which eliminates most of these cliques
 # anyway.
 LEFT_OVER = 10.0
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
