@@ -37,7 +37,7 @@ def _solve(head):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,))
 def _check(head):  # type: ignore[no-untyped-def]
-    return step.check(head) <= step.budget(head)
+    return step.leave_over(head, step.check(head))
 
 
 @kernel(signature=(tb.HEAD,))

@@ -82,9 +82,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         error2 = _solve_and_check(head)
         if tree_update.interrupted(head):
             return tree_update.INTERRUPTED
-        settled = error2 <= LEFT_OVER * budget(head)
-        if error2 <= budget(head):
-            _forget_waiting(head)
+        settled = leave_over(head, error2)
         if settled:
             break
         # The iterations have diverged if the error is large, in sigma^2 and against the lowest
@@ -191,13 +189,21 @@ def _forget_waiting(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def leave_over(head, error2):  # type: ignore[no-untyped-def]
+    """Tell whether a step may leave its errors; those within one budget are forgotten."""
+    if error2 <= _budget(head):
+        _forget_waiting(head)
+    return error2 <= LEFT_OVER * _budget(head)
+
+
+@kernel
 def relinearize(head):  # type: ignore[no-untyped-def]
     """
     Linearize the worst waiting factors again, until 0.1 of the budget remains.
 
     The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
-    allowed = 0.1 * budget(head)
+    allowed = 0.1 * _budget(head)
     waiting, cliques = tb.waiting(head), tb.cliques(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
     bins = tb.work_f(head)[:64]
@@ -253,7 +259,7 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def budget(head):  # type: ignore[no-untyped-def]
+def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
     return min(scalars.budget, scalars.share * scalars.n_moved)
