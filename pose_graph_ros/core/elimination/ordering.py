@@ -20,7 +20,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 
 # A node or an element; an element has the number of its eliminated node.
-ENTRY = np.dtype([(name, 'i8') for name in (
+ENTRY = np.dtype([(name, 'i8' if name == 'outside' else 'i4') for name in (
     'begin', 'length',  # of its list in `iw`
     'n_in',     # number of elements at the front of a node's list
     'weight',   # nodes in the supernode of a principal node; 0: not principal
