@@ -8,28 +8,30 @@ so the solution of the linear system is the step itself.
 
 A chord step reuses the factorisation of an earlier iteration, so it only needs the
 gradient at the new poses, a forward and a backward substitution. It takes a quarter of the time of
-a whole iteration. Near the minimum it converges nearly as fast as Gauss-Newton; far from it, where
-the Jacobians change fast, it does not converge.
+a whole iteration. Near the minimum such steps, each corrected by the one before, converge faster
+than Gauss-Newton; far from it, where the Jacobians change fast, they do not converge.
 """
 
 import math
 
 import numpy as np
 
+from pose_graph_ros.core.batch.levenberg_marquardt import Last, secant_step
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination import assembly
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, Poses
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
 
-def put_poses(memory: tb.Memory, poses: Poses) -> None:
+@kernel(signature=(tb.HEAD, ROWS))
+def put_poses(head, poses):  # type: ignore[no-untyped-def]
     """Write the poses of all nodes, shape (N, 3), unchanged, and make them the references."""
-    rows = memory['nodes'][:len(poses)]
-    rows['pose'] = rows['reference'] = poses
-    for field in ('delta', 'seen', 'checked_turn'):
-        rows[field] = 0.0
+    for v in range(head[tb.N_NODES]):
+        for m in range(3):
+            tb.nodes(head)[v].pose[m] = poses[v, m]
+        factors.refer_to_pose(tb.nodes(head)[v])
 
 
 @kernel(signature=(tb.HEAD, NUMBER, INTEGER))
@@ -37,13 +39,15 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    `terms` says what constraints add; see `assembly`. For LINEARIZED the poses become the
+    `terms` says what constraints add; see `assembly`. But for HEADINGS the poses become the
     references, and all factors are linearized there. Return False if a node is not determined,
     which is `BAD_NODE` of the head, or if it is interrupted.
     """
     scalars = tb.scalars(head)[0]
-    if terms == assembly.LINEARIZED:
+    if terms != assembly.HEADINGS:
         factors.linearize_all(head)
+    if terms == assembly.AS_MEASURED:
+        factors.as_measured(head)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
@@ -73,10 +77,10 @@ def _clique(head, c, right):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD, ROWS, FLAG))
 def step(head, right, chord):  # type: ignore[no-untyped-def]
     """
-    Move all nodes by a step; return the largest change of a coordinate [m, rad].
+    Return the step of all nodes by the last factorisation, which overwrites `right`, (N, 3).
 
-    It is the one of the last factorisation, or a chord step from the present poses with it. Then
-    `right` is -b there, from `evaluate`, shape (N, 3). The step overwrites it.
+    It is the one from where that was done, or a chord step from the present poses. Then `right`
+    is -b there, from `evaluate`.
     """
     n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
     for c in range(n_priors, n_cliques if chord else n_priors):
@@ -86,24 +90,29 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
             v = members[k]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
-    largest = 0.0
     for c in range(n_cliques - 1, n_priors - 1, -1):
         members, n_frontal, values, x = _clique(head, c, right)
         backward_rows(values, 3 * n_frontal, len(x), x, not chord)
         for k in range(n_frontal):
             v = members[k]
             f = tb.nodes(head)[v]
-            if f.fixed != 0:    # known, and zero but in a linear start
-                for m in range(3):
-                    right[v, m] = f.delta[m]
-                continue
-            for m in range(3):
-                right[v, m] = x[3 * k + m]
-                f.delta[m] += right[v, m]
-                if not abs(right[v, m]) <= largest:     # also if it is NaN
-                    largest = abs(right[v, m])
-                f.pose[m] = f.reference[m] + f.delta[m]
-            f.pose[2] = factors.wrap(f.pose[2])
+            for m in range(3):      # what is fixed is known, and zero but in a linear start
+                right[v, m] = x[3 * k + m] if f.fixed == 0 else f.delta[m]
+    return right
+
+
+@kernel(signature=(tb.HEAD, ROWS))
+def move(head, step):  # type: ignore[no-untyped-def]
+    """Move all nodes by a step; return the largest change of a coordinate [m, rad]."""
+    largest = 0.0
+    for v in range(head[tb.N_NODES]):
+        f = tb.nodes(head)[v]
+        for m in range(3):
+            f.delta[m] += step[v, m]
+            if not abs(step[v, m]) <= largest:     # also if it is NaN
+                largest = abs(step[v, m])
+            f.pose[m] = f.reference[m] + f.delta[m]
+        f.pose[2] = factors.wrap(f.pose[2])
     return largest
 
 
@@ -147,56 +156,48 @@ class CompiledSystem:
     """The `System` of `levenberg_marquardt` for a graph in tables whose cliques are planted."""
 
     def __init__(self, memory: tb.Memory) -> None:
-        self._memory, self._head = memory, memory.head
+        self._head = memory.head
         self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
-        # -b, which a chord step overwrites
-        self._right = np.zeros((len(self._rows), 3))
+        self._right = np.zeros((len(self._rows), 3))     # -b
+        self._last: Last = None
 
     @property
     def poses(self) -> Poses:
         return np.array(self._rows['pose'])
 
     def set_poses(self, poses: Poses) -> None:
-        put_poses(self._memory, poses)
+        put_poses(self._head, poses)
 
     def evaluate(self) -> tuple[float, float]:
         chi2, rounding = evaluate(self._head, self._right)
         return chi2, rounding
 
     def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
-        if chord:
-            return float(step(self._head, self._right, True)), 0.0
-        if not eliminate(self._head, damping, assembly.LINEARIZED):
+        if not chord and not eliminate(self._head, damping, assembly.LINEARIZED):
             return math.inf, 0.0
-        length = float(step(self._head, np.zeros_like(self._right), False))
-        return length, float(np.sum(self._right * self._rows['delta']))
+        found = secant_step(lambda right: step(self._head, right, chord), self._right,
+                            self._last if chord else None)
+        self._last = found, self._right.copy()
+        return float(move(self._head, found)), float(np.vdot(self._right, found))
 
 
 def heading_steps(memory: tb.Memory, derivative: FloatArray) -> FloatArray:
     """Return a chord step of the headings of nodes that are not fixed, (F,); nothing moves."""
-    rows = memory['nodes'][:memory.head[tb.N_NODES]]
-    free, kept = rows['fixed'] == 0, rows[['pose', 'delta']].copy()
-    right = np.zeros((len(rows), 3))
+    free = memory['nodes'][:memory.head[tb.N_NODES]]['fixed'] == 0
+    right = np.zeros((len(free), 3))
     right[free, 2] = derivative
     step(memory.head, right, True)
-    rows[['pose', 'delta']] = kept
     return right[free, 2]
 
 
-def solve_chordal(memory: tb.Memory, known: ComplexArray,
-                  headings: ComplexArray | None) -> ComplexArray:
+def solve_chordal(memory: tb.Memory, poses: Poses, place: bool) -> Poses:
     """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
-    rows = memory['nodes'][:memory.head[tb.N_NODES]]
-    fixed = rows['fixed'] != 0
-    if headings is not None:
-        rows['pose'][~fixed, 2] = np.angle(headings[:-1])[~fixed]
-    # the unknowns are the solutions of the nodes
-    delta = rows['delta']
-    for field in ('reference', 'delta', 'seen', 'checked_turn'):
-        rows[field] = 0.0
-    delta[fixed, 0], delta[fixed, 1] = known.real[:-1][fixed], known.imag[:-1][fixed]
-    terms = assembly.HEADINGS if headings is None else assembly.POSITIONS
-    if not eliminate(memory.head, 0.0, terms):
+    put_poses(memory.head, poses)
+    found, rows = np.zeros_like(poses), memory['nodes'][:len(poses)]
+    if not place:
+        fixed, th = rows['fixed'] != 0, poses[:, 2]
+        rows['delta'][fixed, :2] = np.stack((np.cos(th), np.sin(th)), axis=1)[fixed]
+    if not eliminate(memory.head, 0.0, assembly.AS_MEASURED if place else assembly.HEADINGS):
         raise LinearSolveError('chordal start: singular')
-    step(memory.head, np.zeros((len(rows), 3)), False)
-    return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])
+    step(memory.head, found, False)
+    return found + poses if place else found

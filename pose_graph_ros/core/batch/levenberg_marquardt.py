@@ -12,6 +12,9 @@ that no damped step crosses. If chi2 is not below its lowest value after these, 
 restored and lambda grows until a step, or half of it, lowers chi2. Each step that lowers chi2
 reduces lambda, which is set to 0 when it is small and after some damped steps.
 
+Once a step is short, the next ones are chord steps, which keep the factorisation, as long as the
+linear model promises less and less of them. `secant_step` corrects each by the one before.
+
 Nothing in here is compiled; a `System` does the linear algebra.
 """
 
@@ -21,14 +24,16 @@ from enum import Enum
 import math
 from typing import NamedTuple, Protocol, TypeVar
 
-from pose_graph_ros.core.config import SolverConfig
+import numpy as np
+
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import Poses
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 
 # Relative difference of chi2 below which two minima count as the same.
 SAME_MINIMUM = 1e-9
-# Iterations within which a good start converges; if it takes more, the next one is tried.
-TRUSTED_ITERATIONS = 20
+# Iterations that each start is given, and below which a good one converges; if it takes more, the
+# next one is tried.
+TRUSTED_ITERATIONS, GOOD_ITERATIONS = 20, 15
 
 
 class Tuning(NamedTuple):
@@ -51,7 +56,7 @@ class Tuning(NamedTuple):
     # no more than the rounding of the measurements does.
     slow_steps: int = 10
     slow: float = 1e-9
-    # steps that change chi2 by rounding only and do not become shorter, until convergence
+    # steps that change chi2 by rounding only, and are not expected to do less, until convergence
     level_steps: int = 2
     # Where no step lowers chi2, the optimisation has stalled if the linear model predicts a
     # decrease by more than this fraction of chi2 (at least 1), and has converged otherwise. After
@@ -59,10 +64,10 @@ class Tuning(NamedTuple):
     stall: float = 1e-6
     at_the_end: float = 1e-9
     least_decrease: float = 1e-16
-    # largest ratio of the lengths of two steps after which the next one is a chord step: after a
-    # step with a new factorisation, and after a chord step
-    keep_ratio: float = 0.1
-    chord_ratio: float = 0.4
+    # length of a step below which the next one is a chord step
+    chord_length: float = 0.1
+    # least ratio of the lengths of two steps that is believed to go on
+    least_ratio: float = 0.03
     # a step that is no shorter than the last one but below this is rounding noise
     noise_step: float = 1e-7
     # largest predicted sum of all further steps at convergence, as a fraction of the tolerance
@@ -112,7 +117,7 @@ class BatchResult:
 
 def is_trusted(result: BatchResult, before: float) -> bool:
     """Tell whether a start has led to a minimum that is not above chi2 of the poses before."""
-    return result.status is Status.CONVERGED and (
+    return result.status is Status.CONVERGED and result.iterations < GOOD_ITERATIONS and (
         result.chi2 <= before + SAME_MINIMUM * max(before, 1.0))
 
 
@@ -150,27 +155,49 @@ class System(Protocol):
         """
         Move all poses; return the largest change of a coordinate, infinite if H is singular.
 
-        A chord step takes the last factorisation, with the gradient that was noted. Of another one
-        the step times that gradient is returned as well, which a quadratic chi2 falls by.
+        A chord step takes the last factorisation, with the gradient that was noted. The step times
+        that gradient is returned as well, which a quadratic chi2 falls by.
         """
 
 
-def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
+Last = tuple[FloatArray, FloatArray] | None
+"""A step, and -b before it; None where the next step has a new factorisation."""
+
+
+def secant_step(solve: Callable[[FloatArray], FloatArray], right: FloatArray,
+                last: Last) -> FloatArray:
     """
-    Return the result of moving all nodes to a local minimum of chi2, after a pause at each step.
+    Return the step for -b by the last factorisation, corrected by the last step: BFGS.
+
+    What -b has lost by that step tells of H what the factorisation does not hold: the curvature of
+    residuals that remain, and what is different where the poses are now.
+    """
+    step, before = last or (np.zeros_like(right), right)
+    change = before - right
+    curvature = float(np.vdot(step, change))
+    scale = 1.0 / curvature if curvature > 0.0 else 0.0
+    part = scale * float(np.vdot(step, right))
+    found = solve(right - part * change)
+    return found + (part - scale * float(np.vdot(change, found))) * step
+
+
+def minimize(system: System, tolerance: float, most: int) -> Optimization:
+    """
+    Return the result of at most so many steps to a local minimum of chi2, after a pause at each.
 
     The poses are those of the lowest chi2 found, unless it has failed as H is singular.
     """
     best = system.poses
+    chi2, rounding = system.evaluate()
     end, iterations, uphill = Status.MAX_ITERATIONS, 0, 0
     solved = False  # whether any factorisation succeeded
     rejected = False  # whether any step was rejected
     chord = False  # whether the next step is a chord step
     current = False  # whether the tree is that of the best poses, without damping
-    damping = 0.0
+    damping = last_damping = 0.0
     n_damped = n_level = n_slow = 0
-    rounding, shortest, previous, last_damping = 0.0, math.inf, math.inf, 0.0
-    while iterations < config.max_iterations:
+    least = previous = energy = math.inf
+    while iterations < most:
         yield
         trial = math.inf
         length, predicted = system.step(damping, chord=chord)
@@ -190,10 +217,10 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
         current = lower and damping == 0.0
         if lower:
             if not (current and chi2 - trial <= rounding):
-                n_level, shortest = 0, math.inf
-            elif length >= shortest:
+                n_level, least = 0, math.inf
+            elif predicted >= least:
                 n_level += 1
-            shortest = min(shortest, length)
+            least = min(least, predicted)
             slow = damping > 0.0 and chi2 - trial < TUNING.slow * max(chi2, 1.0)
             n_slow = n_slow + 1 if slow else 0
             chi2 = trial
@@ -202,21 +229,21 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
             if n_level >= TUNING.level_steps or n_slow >= TUNING.slow_steps or (
-                    comparable and has_converged(length, previous, config.step_tolerance)):
+                    comparable and has_converged(length, previous, tolerance)):
                 end = Status.CONVERGED
                 break
-            chord = comparable and damping == 0.0 and previous < math.inf and (
-                length < (TUNING.chord_ratio if chord else TUNING.keep_ratio) * previous)
+            chord = (comparable and damping == 0.0
+                     and length < TUNING.chord_length and predicted < energy)
             last_damping = damping
             n_damped = n_damped + 1 if damping > 0.0 else 0
             damping *= TUNING.damping_decay
             if damping < TUNING.least_damping or n_damped >= TUNING.damped_steps:
                 damping, n_damped = 0.0, 0
-            uphill, previous = 0, length
+            uphill, previous, energy = 0, length, predicted
         elif (damping == 0.0 and not chord and trial < math.inf
-              and uphill < TUNING.uphill_steps and iterations + 1 < config.max_iterations):
+              and uphill < TUNING.uphill_steps and iterations + 1 < most):
             iterations += 1
-            uphill, previous = uphill + 1, length
+            uphill, previous, energy = uphill + 1, length, math.inf
         else:
             system.set_poses(best)
             system.evaluate()
@@ -244,8 +271,8 @@ def _refactorized(system: System, end: Status, chi2: float) -> Status:
     if not length < math.inf:
         return Status.FAILED
     system.set_poses(best)
-    least = TUNING.at_the_end if end is Status.MAX_ITERATIONS else TUNING.stall
-    if not predicted > least * max(chi2, 1.0):
+    most = TUNING.at_the_end if end is Status.MAX_ITERATIONS else TUNING.stall
+    if not predicted > most * max(chi2, 1.0):
         return Status.CONVERGED
     return Status.STALLED if end is Status.CONVERGED else end
 
@@ -260,7 +287,5 @@ def has_converged(length: float, previous: float, tolerance: float) -> bool:
     """
     if length >= previous:
         return length < TUNING.noise_step
-    if previous == math.inf:
-        return length < tolerance
-    ratio = length / previous
+    ratio = max(length / previous, TUNING.least_ratio)
     return length * ratio < TUNING.sure * tolerance * (1.0 - ratio)

@@ -10,8 +10,10 @@ condition |u| = 1 both equations are linear.
 
 - `chordal` solves for all headings, normalises them, and solves for all positions: the chordal
   relaxation of L. Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015, in the
-  plane. From this start Gauss-Newton reaches the best known optimum of graphs on which it fails
-  from odometry.
+  plane. Over the cliques, headings are improved together with the positions, by the Jacobians of
+  ends that are where they were measured: L. Carlone et al., "A fast and accurate approximation for
+  planar pose graph optimization", IJRR 2014. From this start Gauss-Newton reaches the best known
+  optimum of graphs on which it fails from odometry.
 - `joint` solves for both together, which needs no measured heading.
 
 Nothing in here is compiled. `gauss_newton.solve_chordal` solves the systems of `chordal` over
@@ -37,11 +39,11 @@ if TYPE_CHECKING:
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
 Ends = Sequence[Blocks]   # one for each end of a constraint
-ChordalSolve = Callable[[ComplexArray, ComplexArray | None], ComplexArray]
+ChordalSolve = Callable[[Poses, bool], Poses]
 """
-Solves for all positions of a graph, given headings u with |u| = 1, or for u if none are given.
+Returns poses with the best positions for the headings of given ones, if it is to place them.
 
-What is known of fixed nodes, and what is returned, are complex numbers, the last that of the map.
+Otherwise it returns the best u of all nodes in place of positions. Fixed nodes stay.
 """
 
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
@@ -180,17 +182,18 @@ def sparse_chordal(graph: Constrained, nodes: NodeSystem | None = None) -> Chord
     terms = Terms.of_factors(graph.factors_by_row, len(graph.poses)).informative()
     system = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
 
-    def solve(known: ComplexArray, headings: ComplexArray | None) -> ComplexArray:
-        if headings is None:
-            root = np.sqrt(terms.kappa)[:, None, None]
-            by = -root * terms.turn[:, None, None], root + 0j
-            right = np.zeros(len(root), complex)
-        else:
+    def solve(poses: Poses, place: bool) -> Poses:
+        t, u = _known(poses)
+        if place:
             root = np.sqrt(terms.tau)[:, None, None]
             by = -root, root
-            right = root[:, 0, 0] * (
-                headings[terms.i] * terms.arm_i - headings[terms.j] * terms.arm_j)
-        return system.solver(by, right[:, None], known[:, None])()[:, 0]
+            right = root[:, 0, 0] * (u[terms.i] * terms.arm_i - u[terms.j] * terms.arm_j)
+        else:
+            root = np.sqrt(terms.kappa)[:, None, None]
+            by, t = (-root * terms.turn[:, None, None], root + 0j), u
+            right = np.zeros(len(root), complex)
+        t = system.solver(by, right[:, None], t[:, None])()[:-1, 0]
+        return np.stack((t.real, t.imag, poses[:, 2]), axis=1)
     return solve
 
 
@@ -206,14 +209,11 @@ def chordal(graph: Constrained, solve: ChordalSolve | None = None, least: float 
     if graph.n_priors > 0:
         raise LinearSolveError('chordal start: a prior has no term for a heading alone')
     solve = solve or sparse_chordal(graph)
-    t, u = _known(graph.poses)
-    u = solve(u, None)
-    length = np.abs(u)
+    u = complex_of(solve(graph.poses.copy(), False))
     # what remains of u where measured headings cancel often leads to another minimum
-    if np.any(length < least):
+    if np.any(np.abs(u) < least):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
-    u /= length
-    return _poses(graph, solve(t, u), u)
+    return se2.wrapped(solve(_poses(graph, np.zeros_like(u), u), True))
 
 
 def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
@@ -262,7 +262,7 @@ def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
                 towards[:, 1] = pull * strength * np.where(
                     length > 0.0, u / np.where(length > 0.0, length, 1.0), 1.0)
                 v = solve(towards)
-    poses = _poses(graph, v[:, 0], v[:, 1])
+    poses = _poses(graph, v[:-1, 0], v[:-1, 1])
     poses[graph.is_bias & ~graph.fixed] = 0.0
     poses[~is_pose & ~graph.fixed, 2] = 0.0
     return poses
@@ -274,8 +274,8 @@ def _known(poses: Poses) -> tuple[ComplexArray, ComplexArray]:
 
 
 def _poses(graph: Constrained, t: ComplexArray, u: ComplexArray) -> Poses:
-    """Return poses from t and u of all nodes and the map; those of fixed nodes stay."""
-    poses = np.stack((t.real, t.imag, se2.wrap(np.angle(u))), axis=1)[:-1]
+    """Return poses from t and u of all nodes; those of fixed nodes stay."""
+    poses = np.stack((t.real, t.imag, se2.wrap(np.angle(u))), axis=1)
     return np.where(graph.fixed[:, None], graph.poses, poses)
 
 

@@ -88,7 +88,7 @@ def in_parts(graph: Graph, config: SolverConfig,
     held = np.zeros(n, dtype=bool)
     held[part[graph.fixed]] = True
     ends = graph.factor_records['ends']
-    held[part[ends[(ends[:, 1] < 0) & (graph.weights > 0.0), 0]]] = True
+    held[part[ends[(ends[:, 1] < 0) & (graph.factor_records['weight'] > 0.0), 0]]] = True
     for prior in graph.priors if graph.n_priors > 0 else ():
         held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
     loose = graph.node_ids[~held[part]]
@@ -99,11 +99,11 @@ def in_parts(graph: Graph, config: SolverConfig,
     plant(graph, cliques)
     poses = graph.poses.copy()
     if starts == (Start.PRESENT,):
-        result = yield from _minimize(graph, config, chi2)
+        result = yield from _minimize(graph, config, config.max_iterations)
     else:
         result = yield from _from_starts(graph, config, starts, chi2)
     if result.status is Status.FAILED:
-        gauss_newton.put_poses(graph.memory, poses)
+        gauss_newton.put_poses(graph.memory.head, poses)
         editing.restart(graph.memory.head)
         return _failed(result.reason, chi2)
     return result
@@ -112,18 +112,18 @@ def in_parts(graph: Graph, config: SolverConfig,
 def _from_starts(graph: Graph, config: SolverConfig, starts: Sequence[Start],
                  chi2: float) -> Optimization:
     """Optimise from several starts, given chi2 of the present poses."""
-    few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
+    few = min(config.max_iterations, TRUSTED_ITERATIONS)
     poses = best_poses = graph.poses.copy()
     best = result = _failed('', chi2)
     yield
     for start in starts:
-        gauss_newton.put_poses(graph.memory, poses)
+        gauss_newton.put_poses(graph.memory.head, poses)
         try:
-            gauss_newton.put_poses(graph.memory, _start(graph, start))
+            gauss_newton.put_poses(graph.memory.head, _start(graph, start))
         except LinearSolveError:
             continue
         yield
-        result = replace((yield from _minimize(graph, few, chi2_of(graph))), start=start)
+        result = replace((yield from _minimize(graph, config, few)), start=start)
         if result.is_better_than(best):
             best, best_poses = result, graph.poses.copy()
         if is_trusted(result, chi2):
@@ -131,9 +131,8 @@ def _from_starts(graph: Graph, config: SolverConfig, starts: Sequence[Start],
     if best.status is Status.FAILED or (
             best is result and best.status is not Status.MAX_ITERATIONS):
         return result
-    gauss_newton.put_poses(graph.memory, best_poses)
-    rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
-    result = yield from _minimize(graph, rest, best.chi2)
+    gauss_newton.put_poses(graph.memory.head, best_poses)
+    result = yield from _minimize(graph, config, max(config.max_iterations - best.iterations, 1))
     return replace(result, start=best.start, iterations=best.iterations + result.iterations)
 
 
@@ -144,52 +143,35 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig) -> BatchResult:
     After a long time without a position the heading may have drifted far. Gauss-Newton can then
     converge to a minimum with the heading wrapped the wrong way round, which takes many
     iterations. The lower of the two minima is kept.
-    Without observed nodes, only the present poses are a start.
+    Without observed nodes, only the present poses are a start. All cliques are eliminated anew at
+    the result.
     """
-    before = graph.poses.copy()
     result = optimize(graph, config)
-    if not _is_observed(graph):
-        return result
-    poses = before if result.status is Status.FAILED else graph.poses.copy()
+    poses = graph.poses.copy()
     try:
-        graph.set_poses(_joint(graph))
+        graph.set_poses(_start(graph, Start.JOINT))
         other = optimize(graph, config)
     except LinearSolveError:
         other = result
     if other.is_better_than(result):
-        return other
+        result, poses = other, graph.poses.copy()
     graph.set_poses(poses)
     return result
-
-
-def _is_observed(graph: Graph) -> bool:
-    """Tell whether the graph has an observed node, or a prior in their place."""
-    return bool(np.any(graph.factors.j < 0)) or any(prior.anchored for prior in graph.priors)
 
 
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     graph.memory.check()
+    large = graph.memory.head[tb.POOL_F_END] > MOST_VALUES
     if start is Start.CHORDAL:
         return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory),
-                                     *([LEAST_HEADING] if _is_large(graph) else []))
+                                     *([LEAST_HEADING] if large else []))
     if start is Start.PRESENT:
         return graph.poses.copy()
-    if start is Start.JOINT and not _is_observed(graph):
-        raise LinearSolveError('joint start: no node is observed')
-    return _joint(graph, unit=start is Start.UNIT)
-
-
-def _is_large(graph: Graph) -> bool:
-    """Tell whether the planted cliques of a graph are too large for SuperLU."""
-    return bool(graph.memory.head[tb.POOL_F_END] > MOST_VALUES)
-
-
-def _joint(graph: Graph, *, unit: bool = False) -> FloatArray:
-    """Return the poses of a start by SuperLU; LinearSolveError if it is not for such a graph."""
-    if _is_large(graph):
-        raise LinearSolveError('joint start: the graph is too large and too dense')
-    return linear_starts.joint(graph, unit=unit)
+    if large or (start is Start.JOINT and not np.any(graph.factors.j < 0) and not any(
+            prior.anchored for prior in graph.priors)):
+        raise LinearSolveError('joint start: the graph is too large, or no node is observed')
+    return linear_starts.joint(graph, unit=start is Start.UNIT)
 
 
 def plant(graph: Graph, cliques: symbolic.Cliques) -> None:
@@ -208,13 +190,14 @@ def chi2_of(graph: Graph) -> float:
     return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
 
 
-def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
+def _minimize(graph: Graph, config: SolverConfig, most: int) -> Optimization:
     """Optimise from the present poses; the poses after a failure have no meaning."""
-    result = yield from minimize(gauss_newton.CompiledSystem(graph.memory), chi2, config)
+    system = gauss_newton.CompiledSystem(graph.memory)
+    result = yield from minimize(system, config.step_tolerance, most)
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(INTERRUPTED if graph.memory.interrupted else
-                       f'hidden node {node} is not determined', chi2)
+                       f'hidden node {node} is not determined', result.chi2)
     editing.settle(graph.memory.head)
     return result
 

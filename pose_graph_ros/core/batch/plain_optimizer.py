@@ -10,6 +10,7 @@ start, and no result unless the poses converge in a few steps.
 """
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -35,8 +36,8 @@ class PlainGraph:
         self.fixed, self.node_kind, self.is_pose = rows.fixed, rows.node_kind, rows.is_pose
         self.factors = self.factors_by_row = rows.factors
         """All edges; ids are rows."""
-        self._nodes: NodeSystem | None = None
-        self._factors: BlockFactors | None = None
+        self._factors: BlockFactors
+        self._last: lm.Last = None
 
     @classmethod
     def is_covered(cls, rows: GraphRows) -> bool:
@@ -76,38 +77,37 @@ class PlainGraph:
         None, with the poses as they were, if it is not reached in a few steps, or is above chi2 of
         the poses before.
         """
-        before, steps, self._factors = self.poses, config.max_iterations, None
+        before = self.poses
         # what overflows has no finite chi2, and is no result
         with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
             try:
-                first = chi2 = self.evaluate()[0]
-                if start is lm.Start.CHORDAL and first < np.inf:
-                    steps = min(steps, lm.TRUSTED_ITERATIONS)
-                    self.poses = chordal(self, sparse_chordal(self, self.nodes))
-                    chi2 = self.evaluate()[0]
+                chi2 = self.evaluate()[0]
                 if chi2 < np.inf:
+                    if start is lm.Start.CHORDAL:
+                        self.poses = chordal(self, sparse_chordal(self, self.nodes))
                     result = lm.to_the_end(lm.minimize(
-                        self, chi2, replace(config, max_iterations=steps)))
-                    if lm.is_trusted(result, first if start is lm.Start.CHORDAL else chi2):
+                        self, config.step_tolerance,
+                        min(config.max_iterations, lm.TRUSTED_ITERATIONS)))
+                    if lm.is_trusted(result, chi2):
                         return replace(result, start=start)
             except LinearSolveError:
                 pass
         self.poses = before
         return None
 
-    @property
+    @cached_property
     def nodes(self) -> NodeSystem:
         """The normal equations, with the place of each node that is not fixed in their order."""
-        if self._nodes is None:
-            self._nodes = NodeSystem(self.factors.i, self.factors.j, ~self.fixed)
-        return self._nodes
+        return NodeSystem(self.factors.i, self.factors.j, ~self.fixed)
 
     def heading_steps(self, derivative: FloatArray) -> FloatArray:
         """Return a step of Gauss-Newton of the headings of nodes that are not fixed, (F,)."""
-        assert self._factors is not None
         right = np.zeros((len(derivative), 3))
         right[:, 2] = derivative
-        return np.asarray(self._factors.solve(right.ravel())[2::3])
+        return self._solved(right)[:, 2]
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        return np.asarray(self._factors.solve(right.ravel())).reshape(-1, 3)
 
     def set_poses(self, poses: FloatArray) -> None:
         """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
@@ -124,10 +124,11 @@ class PlainGraph:
     def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if damping > 0.0:
             raise LinearSolveError('left to the compiled optimiser: it needs damping')
-        if not chord or self._factors is None:
+        if not chord:
             information, (by_i, by_j) = self.factors.information, self._by
             self._factors = self.nodes.factors(self._by, (information @ by_i, information @ by_j))
-        step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
+        step = lm.secant_step(self._solved, self._right, self._last if chord else None)
+        self._last = step, self._right
         poses = self.poses.copy()
         poses[self.nodes.free] += step
         self.set_poses(poses)

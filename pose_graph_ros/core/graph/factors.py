@@ -319,6 +319,20 @@ def linearize_all(head):  # type: ignore[no-untyped-def]
             linearize(head, e)
 
 
+@kernel
+def as_measured(head):  # type: ignore[no-untyped-def]
+    """
+    After `linearize_all`, give edges the Jacobians of ends that are where they were measured.
+
+    So the linear system does not depend on the positions of the nodes, only on their headings.
+    """
+    for e in range(head[tb.N_FACTORS]):
+        f = tb.factors(head)[e]
+        if is_relative(f.kind):
+            c, s, x, y = f.lin_cos, f.lin_sin, f.constants[0], f.constants[1]
+            f.lin_arm[0], f.lin_arm[1] = c * x - s * y, s * x + c * y
+
+
 @kernel(forceinline=True)
 def _form(f, x, y, th):  # type: ignore[no-untyped-def]
     """Return e^T information e."""

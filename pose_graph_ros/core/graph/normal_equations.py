@@ -134,49 +134,30 @@ def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore
 
 
 @kernel
-def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
+def add_headings(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
     """
-    Add an equation of a linear start to a front, as `add` does: of headings, or of positions.
+    Add the equation of headings in a linear start to a front, as `add` does.
 
-    It is `v_j - f v_i = s`, or `v_i = s` where a node is observed, of complex numbers: v is u or t
-    of `batch.linear_starts`. The third unknown of each node is 0.
+    It is `u_j = r u_i`, or `u_i = r` where a node is observed, of complex numbers: see
+    `batch.linear_starts`. The third unknown of each node is 0.
     """
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    i = f.ends[0]
-    kappa = weight = f.weight * f.information[5]
-    fx, fy, sx, sy = 1.0, 0.0, 0.0, 0.0
-    if headings:
-        if b >= 0:
-            fx, fy = math.cos(f.mean[2]), math.sin(f.mean[2])
-        else:
-            th = f.mean[2] - f.constants[2]
-            sx, sy = math.cos(th), math.sin(th)
-    else:
-        weight = 0.5 * f.weight * (f.information[0] + f.information[3])
-        c, s = math.cos(nodes[i].pose[2]), math.sin(nodes[i].pose[2])
-        x, y = (f.mean[0], f.mean[1]) if b >= 0 else (f.constants[0], f.constants[1])
-        sx, sy = c * x - s * y, s * x + c * y
-        if b < 0:
-            sx, sy = f.mean[0] - sx, f.mean[1] - sy
+    f = tb.factors(head)[e]
+    kappa, th = f.weight * f.information[5], f.mean[2] - (f.constants[2] if b < 0 else 0.0)
+    c, s = kappa * math.cos(th), kappa * math.sin(th)
     for at in (a, b):
-        if at >= 0:
-            front[at * (ld + 1)] += weight
-            front[(at + 1) * (ld + 1)] += weight
-            front[(at + 2) * (ld + 1)] += kappa
-    last, right = b if b >= 0 else a, ld - 1
-    front[last * ld + right] += weight * sx
-    front[(last + 1) * ld + right] += weight * sy
+        for m in range(3 if at >= 0 else 0):
+            front[(at + m) * (ld + 1)] += kappa
     if b < 0:
+        front[(a + 1) * ld - 1] += c
+        front[(a + 2) * ld - 1] += s
         return
-    front[a * ld + right] -= weight * (fx * sx + fy * sy)
-    front[(a + 1) * ld + right] -= weight * (fx * sy - fy * sx)
     if a > b:
-        a, b, fy = b, a, -fy
-    r = a * ld + b      # block ij is that of -weight conj(f)
-    front[r] -= weight * fx
-    front[r + 1] -= weight * fy
-    front[r + ld] += weight * fy
-    front[r + ld + 1] -= weight * fx
+        a, b, s = b, a, -s
+    r = a * ld + b      # block ij is that of -kappa conj(r)
+    front[r] -= c
+    front[r + 1] -= s
+    front[r + ld] += s
+    front[r + ld + 1] -= c
 
 
 @kernel

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of a batch iteration against dense matrices: steps, chi2."""
 
+from functools import partial
+
 from hypothesis import assume, given, settings, strategies as st
 import numpy as np
 import pytest
 from random_graphs import dense_system, free_part, random_graph
 
 from pose_graph_ros.core.batch import gauss_newton, optimizer
+from pose_graph_ros.core.batch.levenberg_marquardt import secant_step
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.elimination.assembly import LINEARIZED
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -39,7 +42,8 @@ def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     """Make a step; return the solution of the free nodes, in the order of H."""
     head = graph.memory.head
     assert gauss_newton.eliminate(head, damping, LINEARIZED)
-    length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
+    found = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
+    length = gauss_newton.move(head, found)
     step = graph.node_records['delta']
     assert length == np.max(np.abs(step))
     np.testing.assert_array_equal(step[graph.fixed], 0.0)
@@ -61,7 +65,7 @@ def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
         np.testing.assert_allclose(
             full_step(graph, damping), expected, rtol=ROUNDING,
             atol=ROUNDING * np.max(np.abs(expected)))
-        gauss_newton.put_poses(graph.memory, poses)
+        gauss_newton.put_poses(graph.memory.head, poses)
 
 
 @given(seeds)
@@ -77,7 +81,7 @@ def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None
         before = graph.poses.copy()
         gauss_newton.evaluate(head, right)
         expected = -np.linalg.solve(H, free_part(graph, *dense_system(graph))[1])
-        length = gauss_newton.step(head, right, True)
+        length = gauss_newton.move(head, gauss_newton.step(head, right, True))
         size = np.max(np.abs(expected))
         assert length == pytest.approx(size, rel=ROUNDING)
         step = (graph.poses - before)[~graph.fixed]
@@ -85,6 +89,22 @@ def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None
         step[:, 2] -= 2.0 * np.pi * turns
         np.testing.assert_allclose(step.ravel(), expected, rtol=ROUNDING, atol=ROUNDING * size)
         np.testing.assert_array_equal(graph.poses[graph.fixed], before[graph.fixed])
+
+
+@given(seeds, st.floats(0.3, 10.0))
+def test_a_step_is_corrected_by_what_the_gradient_has_changed_by_in_the_last_one(
+    seed: int, factor: float,
+) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(6, 6))
+    kept = root @ root.T + np.eye(6)
+    right = rng.normal(size=6)
+    first = secant_step(partial(np.linalg.solve, kept), right, None)
+    np.testing.assert_allclose(kept @ first, right, atol=1e-9)
+    # the true matrix is the one that is kept, times a factor
+    after = right - factor * kept @ first
+    second = secant_step(partial(np.linalg.solve, kept), after, (first, right))
+    np.testing.assert_allclose(factor * kept @ second, after, atol=1e-9)
 
 
 @given(seeds)
