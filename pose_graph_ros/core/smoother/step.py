@@ -231,7 +231,6 @@ def relinearize(head):  # type: ignore[no-untyped-def]
             factors.linearize(head, e)
             for v in f.ends:
                 if v >= 0:
-                    transaction_log.log_node(head, v)
                     touch(head, v)
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
@@ -245,7 +244,6 @@ def relinearize(head):  # type: ignore[no-untyped-def]
 def _touch_clique(head, c):  # type: ignore[no-untyped-def]
     """Touch a clique, whose elimination linearizes something again."""
     v = tb.pool_i(head)[tb.cliques(head)[c].members]
-    transaction_log.log_node(head, v)
     touch(head, v)
     head[tb.N_RELINEARIZED] += 1
 
@@ -285,7 +283,7 @@ def check(head):  # type: ignore[no-untyped-def]
     work_i, iteration = tb.work_i(head), head[tb.ITERATION]
     checks, turned = work_i[head[tb.NODE_ROOM]:], work_i[2 * head[tb.NODE_ROOM]:]
     large = factors.LEAST_FRACTION * scalars.share
-    scalars.error2_sum = 0.0
+    chi2, error2_sum = scalars.chi2, 0.0
     owner, frame = -1, factors.NO_TURN  # those that follow each other often have the same owner
     for n in range(head[tb.N_CHECKS]):
         at = tb.nodes(head)[checks[n]].factor_list
@@ -301,10 +299,10 @@ def check(head):  # type: ignore[no-untyped-def]
                 versine, sine = factors.turned_by(phi)
                 frame = (phi, 1.0 + versine, sine)
             transaction_log.log_factor(head, e)
-            scalars.chi2 -= f.energy
+            chi2 -= f.energy
             factors.check(head, e, frame)
-            scalars.chi2 += f.energy
-            scalars.error2_sum += f.error2
+            chi2 += f.energy
+            error2_sum += f.error2
             if f.error2 > large and f.waits == 0:
                 f.waits = 1
                 waiting[head[tb.N_WAITING]] = e
@@ -313,11 +311,12 @@ def check(head):  # type: ignore[no-untyped-def]
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
         error2 = clique_frames.slip_error2(head, c, tb.work_f(head))
-        scalars.error2_sum += error2
+        error2_sum += error2
         if error2 > large:
             cliques[c].slip_error2 = error2
             turned[kept] = c
             kept += 1
     head[tb.N_TURNED] = kept
     head[tb.N_ITERATIONS] += 1
-    return scalars.error2_sum
+    scalars.chi2, scalars.error2_sum = chi2, error2_sum
+    return error2_sum
