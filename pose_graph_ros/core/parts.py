@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.alignment import Alignment, AlignmentState, guess
 from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.config import Loss, Robust
@@ -223,19 +224,31 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     """
     Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
     """
-    found = []
-    for _, source, given in parts.pipeline.waiting_until(parts.nodes.newest_ns):
-        attachment = parts.nodes.attach_ahead(given.stamp_ns)
+    found, pipeline, factors = [], parts.pipeline, parts.factors
+    # most of them waited at the last estimate, too, behind the same node
+    known, pipeline.ahead = pipeline.ahead, {}
+    nodes = parts.nodes
+    behind = int(nodes.ids[-1]), sum(each.n_sorted for each in nodes.streams.values())
+    for _, source, given in pipeline.waiting_until(nodes.newest_ns):
         # the first one of a source may set the origin of the map, but not before it is attached
-        if attachment is None or not parts.factors.has(source):
+        if not factors.has(source):
             continue
-        measurement = KINDS[type(given)].in_map(given)
-        if measurement is None:
+        key = source, type(given), given.stamp_ns, behind
+        if (queued := known.get(key) or _ahead(parts, source, given)) is None:
             continue
-        settings = parts.factors.config.measurement_source(source, type(measurement))
-        found.append((parts.factors.preview(observed(source, measurement, attachment)),
-                      settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE))
+        pipeline.ahead[key] = queued
+        settings = factors.config.measurement_source(source, queued.measured)
+        found.append((factors.preview(queued), settings.robust is Robust.JUDGED
+                      or settings.applied_loss is not Loss.NONE))
     return found
+
+
+def _ahead(parts: Parts, source: str, given: ms.PoseMeasurement) -> Queued | None:
+    """Return what waits as a constraint on the newest node; None if it cannot be one yet."""
+    attachment = parts.nodes.attach_ahead(given.stamp_ns)
+    measurement = None if attachment is None else KINDS[type(given)].in_map(given)
+    return None if attachment is None or measurement is None else observed(
+        source, measurement, attachment)
 
 
 def _joint(smoother: IncrementalSmoother, ids: list[int]) -> FloatArray:

@@ -94,6 +94,8 @@ class MeasurementPipeline:
         # measurements that wait for odometry to reach their stamps, in the order of these, then of
         # their arrival
         self.waiting: list[WaitingMeasurement] = []
+        # those that odometry has passed, as constraints at the last estimate
+        self.ahead: dict[object, Queued] = {}
         self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
         self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
@@ -176,6 +178,8 @@ class MeasurementPipeline:
         """Attach the measurements whose stamps odometry has reached, and make rotations."""
         if len(self.gyros.streams) > 0:
             self._take_turns()
+        if len(self.waiting) == 0 or self.waiting[0].due_ns > self.nodes.covered_ns:
+            return
         due = self.waiting_until(self.nodes.covered_ns)
         del self.waiting[:len(due)]
         for waiting in due:
