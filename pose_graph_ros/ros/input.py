@@ -237,7 +237,8 @@ class TimeJumps:
             return Decision([], is_old=True)
         newest_ns = self._keeper.now_ns
         judged = self._keeper.judge(received.source, received.measurement)
-        received = received._replace(refusal=judged.refusal)
+        if judged.refusal is not None:
+            received = received._replace(refusal=judged.refusal)
         if judged.jump_ns > 0:
             self.senders.forget()
             self._expect_old(newest_ns, judged.jump_ns, {received.source})

@@ -5,7 +5,7 @@ The outputs of the node, with strictly increasing stamps.
 
 Pose, odometry, fix and transform are published with each odometry message, from the executor's
 thread; path, markers and verdicts, which can be large, from the thread that owns the engine. All
-but the transform and the diagnostics are made only while there is a subscriber. Of the transform
+but the diagnostics are made only while there is a subscriber. Of the transform
 it is also about its speed, and others that publish it.
 """
 
@@ -302,6 +302,8 @@ class TransformPublisher:
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
+        if self._publisher.get_subscription_count() == 0:
+            return
         self._own.append((at_ns, float(T_map_odom[0]), math.sin(T_map_odom[2] / 2.0)))
         self._publisher.publish(output_cdr.transform_cdr(
             at_ns, T_map_odom, self._map_frame, self._odom_frame))

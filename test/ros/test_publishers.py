@@ -74,7 +74,9 @@ class Outlets(dict[str, Outlet]):
     warnings: tuple[str, ...] | list[str] = ()
 
     def create_publisher(self, kind: type, topic: str, *_: object, **__: object) -> Outlet:
-        return self.setdefault(topic, Outlet(kind, topic))
+        outlet = self.setdefault(topic, Outlet(kind, topic))
+        outlet.listeners = 1
+        return outlet
 
     def destroy_publisher(self, outlet: Outlet) -> None:
         outlet.listeners = 0
