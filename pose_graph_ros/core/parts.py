@@ -255,31 +255,29 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     """
     Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
     """
-    found, pipeline, factors = [], parts.pipeline, parts.factors
+    pipeline, factors, nodes = parts.pipeline, parts.factors, parts.nodes
     # most of them waited at the last estimate, too, behind the same node
     known, pipeline.ahead = pipeline.ahead, {}
-    nodes = parts.nodes
     behind = int(nodes.ids[-1]), sum(each.n_sorted for each in nodes.streams.values())
     for _, source, given in pipeline.waiting_until(nodes.newest_ns):
         # the first one of a source may set the origin of the map, but not before it is attached
         if not factors.has(source):
             continue
-        key = source, type(given), given.stamp_ns, behind
-        if (queued := known.get(key) or _ahead(parts, source, given)) is None:
-            continue
-        pipeline.ahead[key] = queued
-        settings = factors.config.measurement_source(source, queued.measured)
-        found.append((factors.preview(queued), settings.robust is Robust.JUDGED
-                      or settings.applied_loss is not Loss.NONE))
-    return found
+        key = source, type(given), given.stamp_ns, behind, factors.treatment(source)
+        if (ahead := known.get(key) or _ahead(parts, source, given)) is not None:
+            pipeline.ahead[key] = ahead
+    return [*pipeline.ahead.values()]
 
 
-def _ahead(parts: Parts, source: str, given: ms.PoseMeasurement) -> Queued | None:
+def _ahead(parts: Parts, source: str, given: ms.PoseMeasurement) -> tuple[Factors, bool] | None:
     """Return what waits as a constraint on the newest node; None if it cannot be one yet."""
     attachment = parts.nodes.attach_ahead(given.stamp_ns)
     measurement = None if attachment is None else KINDS[type(given)].in_map(given)
-    return None if attachment is None or measurement is None else observed(
-        source, measurement, attachment)
+    if attachment is None or measurement is None:
+        return None
+    settings = parts.factors.config.measurement_source(source, type(measurement))
+    return (parts.factors.preview(observed(source, measurement, attachment)),
+            settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE)
 
 
 def _joint(smoother: IncrementalSmoother, ids: list[int]) -> FloatArray:

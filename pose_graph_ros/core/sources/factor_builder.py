@@ -206,6 +206,12 @@ class FactorBuilder:
         return (self._state(queued.source).errors if settings.finds_correlation
                 else _given(settings))
 
+    def treatment(self, source: str) -> tuple[object, ...]:
+        """Return what changes when measurements of a source would be treated otherwise."""
+        bias = self._state(source).bias
+        return (self.errors_in_use(source),
+                *(() if bias is None else (len(bias), *bias.nodes[-1:].tolist())))
+
     def preview(self, queued: Queued) -> Factors:
         """Return a measurement as an edge to the last state of the bias before it, or to -1."""
         chain = self._state(queued.source).bias or bs.BiasChain()

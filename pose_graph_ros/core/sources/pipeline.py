@@ -14,7 +14,7 @@ import numpy as np
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.stream import ReorderBuffer
 from pose_graph_ros.core.sources.gyro import Gyros
@@ -94,8 +94,8 @@ class MeasurementPipeline:
         # measurements that wait for odometry to reach their stamps, in the order of these, then of
         # their arrival
         self.waiting: list[WaitingMeasurement] = []
-        # those that odometry has passed, as constraints at the last estimate
-        self.ahead: dict[object, Queued] = {}
+        # those that odometry has passed, as constraints at the last estimate, and if each is gated
+        self.ahead: dict[object, tuple[Factors, bool]] = {}
         self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
         self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
