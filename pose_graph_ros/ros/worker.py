@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 import logging
+import math
 import threading
 import time
 from typing import Any, TypeVar
@@ -45,6 +46,9 @@ Job = Callable[[PoseGraphBackend], Result]
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
 GATHERING = 0.1
+# Where updates follow one another, what each leaves to a refinement is too little to be seen: it
+# is refined so long after the last time [s].
+PAUSE = 1.0
 MOST_JOBS = 100  # of a kind that wait; the oldest is dropped
 
 
@@ -96,7 +100,9 @@ class Worker:
         self._n_dropped = 0  # number of jobs that were too many
         self._stopping = False
         self.watchdog = Watchdog()
-        self._may_refine = False
+        # from when on the estimate is to be refined, and when that was done last [s]
+        self._refine_at, self._refined_at = math.inf, -math.inf
+        self._whole_at = -math.inf  # when the whole status was made last [s]
         # since the last estimate: the distance that nodes have moved [m], and measurements added
         self._refined, self._n_added = 0.0, 0
         self._condition = threading.Condition()
@@ -207,10 +213,12 @@ class Worker:
         self.prepared = True
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: (
-                    self._may_refine or len(self._inbox) > 0 or self._has_more_to_do()))
+                wait = max(self._refine_at - time.monotonic(), 0.0)
+                found = self._condition.wait_for(
+                    lambda: len(self._inbox) > 0 or self._has_more_to_do(),
+                    None if wait == math.inf else wait)
                 # until there is an estimate no pose can be published
-                if self.estimate is not None and not self._may_refine:
+                if found and self.estimate is not None and wait > 0.0:
                     self._condition.wait_for(self._has_more_to_do, GATHERING)
                 if self._stopping:
                     for _, future in self._jobs.values():
@@ -227,7 +235,7 @@ class Worker:
                 else:
                     self._process(batch, wanted=wanted)
             except Exception as error:
-                self._may_refine = False
+                self._refine_at = math.inf
                 self._count_failure('a refinement' if refines else 'an update', error, len(batch))
             for (what, _), (job, future) in jobs.items():
                 self._do(what, job, future)
@@ -268,16 +276,21 @@ class Worker:
                 self._n_added + report.new_constraints + report.iterations > 0)):
             self._publish()
         self._report(report, len(batch))
-        self._may_refine = self._may_refine or report is not None
+        if report is not None:
+            # what is unfinished or to be tried is not put off
+            self._refine_at = min(self._refine_at, 0.0 if (
+                report.status is not Status.CONVERGED) else self._refined_at + PAUSE)
 
     def _refine(self) -> None:
         """Refine a little, while there is nothing else to do; publish moves that can be seen."""
         with self.watchdog.over(self._backend, 'a refinement'):
             result = self._backend.refine()
-        self._may_refine = not result.finished
+        self._refine_at = 0.0
+        if result.finished:
+            self._refine_at, self._refined_at = math.inf, time.monotonic()
         self._refined += result.moved
         # it judges again, too; and a move that can be seen [m]
-        if (result.finished and self._report(None, 0) > 0) or self._refined > 1e-3:
+        if (result.finished and self._report(None, 0, whole=True) > 0) or self._refined > 1e-3:
             self._publish()
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
@@ -300,7 +313,7 @@ class Worker:
         report = self._update(backend.optimize)
         self.is_optimal = report.status is Status.CONVERGED
         self._publish()
-        self._report(report, 0)
+        self._report(report, 0, whole=True)
         return report
 
     def _note(self, act: str, *values: object) -> None:
@@ -348,26 +361,27 @@ class Worker:
         if self.estimate is not None and not self._stopping:
             self._on_estimate(self._backend)
 
-    def _report(self, report: UpdateReport | None, processed: int) -> int:
+    def _report(self, report: UpdateReport | None, processed: int, *, whole: bool = False) -> int:
         """
         Replace the status; return the number of changes of verdicts, which are announced.
 
-        It keeps the report of the last update if there is no new one.
+        It keeps the report of the last update if there is no new one. What people look at is made
+        anew after a change of verdicts and a refinement, which follows the last update.
         """
         status, backend = self.status, self._backend
         for source, stream in backend.odometry.items():
             if stream.n_jumps > self._jumps[source]:
                 logger.warning('%s jumped %s: its motion there is not used', source, stream.jump)
             self._jumps[source] = stream.n_jumps
-        changes, verdicts = backend.verdict_changes(), status.verdicts
-        if report is not None or len(changes) > 0:
-            # all else changes nothing of these
-            verdicts = backend.verdict_totals()
+        changes, now = backend.verdict_changes(), time.monotonic()
+        if whole or len(changes) > 0 or now - self._whole_at >= PAUSE:
+            self._whole_at = now
             status = replace(
                 status, quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
-                verdicts=verdicts, biases=backend.gyro_biases(backend.graph),
-                calibrations=backend.calibrations(), differences=backend.gyro_differences())
-        doubted = {source for source, each in verdicts.items() if each.doubting}
+                verdicts=backend.verdict_totals(), biases=backend.gyro_biases(backend.graph),
+                calibrations=backend.calibrations(), differences=backend.gyro_differences(),
+                sources=backend.reports())
+        doubted = {source for source, each in status.verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
         counts = backend.counts + Counter({('worker', 'dropped_job'): self._n_dropped})
@@ -375,7 +389,6 @@ class Worker:
             status, processed=status.processed + processed, counts=counts,
             refusals=dict(backend.refusals), pending=backend.n_waiting,
             report=status.report if report is None else report,
-            sources=status.sources if report is None else backend.reports(),
             n_changes=status.n_changes + len(changes))
         return len(changes)
 

@@ -15,6 +15,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
+from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
 from pose_graph_ros.core.smoother.incremental import Refinement
 from pose_graph_ros.ros.worker import Worker
@@ -211,3 +212,24 @@ def test_between_updates_the_estimate_is_refined_until_nothing_is_left(start: St
     assert len(backend.refinements) == n    # the thread sleeps
     worker.call(worker.optimize_fully).result(PATIENCE)
     np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.001)
+
+
+def test_where_updates_follow_one_another_it_is_refined_now_and_then(
+    start: Start, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('pose_graph_ros.ros.worker.PAUSE', 0.3)
+    backend = Recording(BackendConfig(odometry={'odom': OdometrySource(reorder_window=0.0)}))
+    worker = start(backend)
+
+    def is_refined(n: int) -> bool:
+        return sum(refinement.finished for refinement in backend.refinements) >= n
+
+    for step in range(1, 3):    # the first one at once
+        worker.post('odom', sample(step))
+        worker.post('pose', GlobalPose(
+            step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]), 0.01 * np.eye(3)))
+        begin = time.monotonic()
+        worker.request_update()
+        wait_until(lambda step=step: is_refined(step))
+    assert time.monotonic() - begin > 0.25
+    wait_until(lambda: worker.status.verdicts['pose'].counts[State.BELIEVED] == 2)
