@@ -95,6 +95,9 @@ class Publishers:
                             for source in sources.source_list(values) if source.kind.in_map]
         self._awaits_map = False    # whether there ever was a publisher on one of these
         self._newest_ns = 0
+        # to ask who listens takes as long as to write a message: it is done with each estimate
+        self._asked: Estimate | None
+        self._wanted: list[Publisher] = []
         self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
         self._lock = threading.Lock()
@@ -110,6 +113,7 @@ class Publishers:
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
+        self._asked = None
         self._waits = values['wait_for_map']
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = tuple(values['transform_slew'])
@@ -124,11 +128,15 @@ class Publishers:
         if stamp <= self._newest_ns or self._holds(estimate):
             return
         self._newest_ns = stamp
-        if (self.transforms is not None
+        if estimate is not self._asked:
+            self._asked, self._wanted = estimate, [publisher for publisher in (
+                self._pose, self._odometry, self._fix, *(
+                    [] if self.transforms is None else [self.transforms.publisher]))
+                if publisher.get_subscription_count() > 0]
+        wanted = self._wanted
+        if (self.transforms is not None and self.transforms.publisher in wanted
                 and frame(odometry.header.frame_id) in ('', self.odom_frame)):
             self.transforms.publish(estimate, sample, self._tf_offset_ns, self._slew_limits)
-        wanted = [publisher for publisher in (self._pose, self._odometry, self._fix)
-                  if publisher.get_subscription_count() > 0]
         if len(wanted) == 0:
             return
         prediction = predict(estimate, sample)
@@ -281,7 +289,7 @@ class TransformPublisher:
 
     def __init__(self, node: Node, map_frame: str, odom_frame: str) -> None:
         self._node = node
-        self._publisher = node.create_publisher(TFMessage, TOPIC, **topics.overridable(TF_QOS))
+        self.publisher = node.create_publisher(TFMessage, TOPIC, **topics.overridable(TF_QOS))
         self._map_frame, self._odom_frame = map_frame, odom_frame
         self._newest_ns, self._aligned, self.slew = 0, False, Slew()
         # its newest, to recognise them
@@ -302,10 +310,8 @@ class TransformPublisher:
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
-        if self._publisher.get_subscription_count() == 0:
-            return
         self._own.append((at_ns, float(T_map_odom[0]), math.sin(T_map_odom[2] / 2.0)))
-        self._publisher.publish(output_cdr.transform_cdr(
+        self.publisher.publish(output_cdr.transform_cdr(
             at_ns, T_map_odom, self._map_frame, self._odom_frame))
 
     def forget(self) -> None:
@@ -327,7 +333,7 @@ class TransformPublisher:
     def close(self) -> None:
         """Destroy the publisher and the subscription."""
         self._stop_listening()
-        self._node.destroy_publisher(self._publisher)
+        self._node.destroy_publisher(self.publisher)
 
     def _stop_listening(self) -> None:
         if self._subscription is not None:
