@@ -198,7 +198,7 @@ class Alignment:
         if graph.node_rows(node) < 0 or node < nodes.ids[nodes.n_frozen]:
             return None
         off = abs(float(se2.wrap(pose[2] - graph.poses_of(node)[2])))
-        if off <= max(OFF, OFF_SIGMAS * bank.heading_sigma):
+        if off <= OFF or off <= OFF_SIGMAS * bank.heading_sigma:
             return None
         self._next_check = 2 * n_seen
         ids = nodes.ids[nodes.n_frozen:]

@@ -39,6 +39,8 @@ def wrap(angle: npt.ArrayLike) -> FloatArray:
     Angles inside the interval are returned unchanged, bit for bit.
     """
     angle = np.asarray(angle, dtype=np.float64)
+    if angle.ndim == 0:     # as most are; the rest takes ten times as long
+        return np.asarray(wrap_one(float(angle)))
     wrapped = np.mod(angle + np.pi, TWO_PI) - np.pi
     # mod may round up to 2 pi for a tiny negative argument
     wrapped = np.where(wrapped >= np.pi, -np.pi, wrapped)
@@ -71,6 +73,8 @@ def transform(pose: FloatArray, point: FloatArray) -> FloatArray:
 
 def compose(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return `T_a_c` from `T_a_b` and `T_b_c`."""
+    if a.ndim == b.ndim == 1:
+        return np.array(compose_one(a.tolist(), b.tolist()))
     position = transform(a, b[..., :2])
     theta = wrap(a[..., 2] + b[..., 2])
     return np.concatenate((position, theta[..., None]), axis=-1)
@@ -86,6 +90,8 @@ def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
 
 def inverse(a: FloatArray) -> FloatArray:
     """Return `T_b_a` from `T_a_b`, shape (..., 3)."""
+    if a.ndim == 1:
+        return np.array(between_one(a.tolist(), (0.0, 0.0, 0.0)))
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x, y = a[..., 0], a[..., 1]
     return np.stack((-c * x - s * y, s * x - c * y, wrap(-a[..., 2])), axis=-1)
@@ -93,6 +99,8 @@ def inverse(a: FloatArray) -> FloatArray:
 
 def between(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return `T_a_b` from `T_w_a` and `T_w_b`: the pose of b relative to a."""
+    if a.ndim == b.ndim == 1:
+        return np.array(between_one(a.tolist(), b.tolist()))
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
     return np.stack((c * dx + s * dy, c * dy - s * dx, wrap(b[..., 2] - a[..., 2])), axis=-1)

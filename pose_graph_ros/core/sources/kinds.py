@@ -9,6 +9,7 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 """
 
 from collections.abc import Callable
+import math
 from typing import Any, NamedTuple
 import zlib
 
@@ -175,9 +176,11 @@ def swept_variance(measurement: ms.Position | ms.Range, attachment: Attachment) 
     given in the frame of the robot, whose heading in the map is unknown. The largest eigenvalue of
     its covariance is therefore used in all directions.
     """
-    jacobian = np.eye(2, 3)
-    jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
-    return float(np.linalg.eigvalsh(jacobian @ attachment.noise @ jacobian.T)[-1])
+    (x, y), ((xx, xy, xt), (_, yy, yt), (*_, tt)) = (
+        measurement.lever_arm.tolist(), attachment.noise.tolist())
+    a, b, c = xx - (2.0 * xt - y * tt) * y, xy + xt * x - yt * y - tt * x * y, (
+        yy + (2.0 * yt + x * tt) * x)
+    return 0.5 * (a + c) + math.hypot(0.5 * (a - c), b)
 
 
 def loop_closure_constraint(given: ms.LoopClosure, first: Attachment, at: Attachment) -> Factors:
