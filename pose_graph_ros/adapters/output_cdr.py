@@ -30,7 +30,7 @@ CDR = b'\x00\x01\x00\x00'  # little endian
 Colours = npt.NDArray[np.float32]
 _STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
 _POSE, _POSE_WITH_COVARIANCE = struct.Struct('<7d'), struct.Struct('<43d')
-_TWIST_WITH_COVARIANCE = struct.Struct('<42d')
+_TWIST = struct.Struct('<6d')
 _UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
@@ -60,12 +60,15 @@ def odometry_cdr(stamp_ns: int, prediction: Prediction, source: Message, map_fra
     """Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry."""
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular
-    numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *twist.covariance)
-    # a finite sum is the quick way to tell
-    finite = math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))
+    numbers = linear.x, linear.y, linear.z, angular.x, angular.y, angular.z
+    covariance = np.asarray(twist.covariance, dtype=np.float64)
+    # a finite sum of squares is the quick way to tell
+    finite = math.isfinite(sum(numbers) + covariance.dot(covariance)) or (
+        all(map(math.isfinite, numbers)) and bool(np.all(np.isfinite(covariance))))
     return b''.join((_head(stamp_ns, map_frame, base_frame),
                      _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
-                     _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
+                     *((_TWIST.pack(*numbers), covariance.tobytes()) if finite
+                       else (_UNKNOWN_TWIST,))))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:

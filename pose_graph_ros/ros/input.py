@@ -233,15 +233,14 @@ class TimeJumps:
 
     def receive(self, received: ReceivedMessage) -> Decision:
         """Return which messages can be used, now that this one has come."""
-        if self._is_old(received):
+        if self._drained is not None and self._is_old(received):
             return Decision([], is_old=True)
-        newest_ns = self._keeper.now_ns
         judged = self._keeper.judge(received.source, received.measurement)
         if judged.refusal is not None:
             received = received._replace(refusal=judged.refusal)
         if judged.jump_ns > 0:
             self.senders.forget()
-            self._expect_old(newest_ns, judged.jump_ns, {received.source})
+            self._expect_old(judged.before_ns, judged.jump_ns, {received.source})
             return Decision(self.release(received), judged.jump_ns)
         if self._keeper.in_doubt and len(self._held) < 10_000:
             self._held.append(received)
