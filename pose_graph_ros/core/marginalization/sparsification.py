@@ -27,8 +27,6 @@ by the prior, by the pose with which that is smallest.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pose_graph_ros.core.geometry import covariance as cov, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -212,6 +210,10 @@ def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> Fl
 
 def _spanning_tree(found: _Candidates, n: int) -> IntArray:
     """Return the rows of the tree over n nodes with the smallest sum of weights."""
+    # 150 modules, with 15 MB
+    from scipy.sparse import csr_array  # noqa: PLC0415  most graphs do not need it
+    from scipy.sparse.csgraph import minimum_spanning_tree  # noqa: PLC0415  most graphs do not need it
+
     ends = found.i, found.j
     weights = found.weights - np.min(found.weights, initial=0.0) + 1.0  # 0 stands for no edge
     row = np.zeros((n, n), dtype=np.int64)

@@ -29,7 +29,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.csgraph import breadth_first_order
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
@@ -98,6 +97,8 @@ def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[mg.Cut], list[Facto
 
     With each cut comes what it leaves on the first state that stays, of the kind NODE_PRIOR.
     """
+    from scipy.sparse.csgraph import breadth_first_order  # noqa: PLC0415  most graphs do not need it
+
     factors = graph.factors
     rows = np.flatnonzero((factors.weight > 0.0) & (factors.j >= 0) & (factors.k < 0)
                           & (np.isin(factors.i, biases) | np.isin(factors.j, biases)))

@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple, Self
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.geometry import se2
@@ -110,6 +109,8 @@ def crowded(poses: Poses, preferred: BoolArray, config: ThinningConfig,
     """
     Return rows of poses that leave, ascending, each with that of its anchor, shape (L, 2).
     """
+    from scipy.spatial import KDTree  # noqa: PLC0415  most graphs do not need it
+
     order = np.argsort(~preferred, kind='stable')
     place, heading = poses[order, :2], poses[order, 2]
     anchor = np.full(len(poses), -1, dtype=np.int64)
