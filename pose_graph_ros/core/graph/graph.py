@@ -398,6 +398,7 @@ class Graph:
     def commit(self) -> Gone:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
         transaction_log.commit(self.memory.head)
+        self.memory.clear_log()
         self._updating = False
         return editing.compact(self.memory)
 

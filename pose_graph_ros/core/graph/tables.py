@@ -167,7 +167,7 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 #   FREE_CLIQUE: first unused row of the cliques
 #   POOL_F_END, POOL_I_END: ends of what has ever been taken from the pools
 #   N_TOUCHED, N_FREED, N_WAITING: numbers of entries of `touched`, `freed` and `waiting`
-#   LOG_END: end of the log
+#   LOG_END, LOGGED: end of the log, and the largest one since the log has given its pages back
 #   UPDATE, ITERATION, FRONT_SERIAL: number of the update, the iteration and the front
 #   STRUCTURE: 1 if the next elimination needs a new ordering
 #   NEED_F, NEED_I, NEED_WORK: capacities of pool_f, pool_i and work_f that a step lacks
@@ -192,10 +192,10 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 # A rollback restores the first ones, up to LOOSE.
 (N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, FIXED, NEXT_NODE, NEXT_FACTOR,
  N_LEAVING, N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END,
- UPDATE, ITERATION, FRONT_SERIAL,
+ UPDATE, ITERATION, FRONT_SERIAL, LOGGED,
  NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
  N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
- REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 41)
+ REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 42)
 # Number of sizes of blocks in the pools, the largest of which have 2**31 numbers.
 N_SIZES: Final = 212
 # Heads of the free lists of pool_f and pool_i, one for each size.
@@ -267,6 +267,7 @@ def as_bytes(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 MOST = {'pool_f': 2**31 - 1}  # rows; cliques have indices of 32 bits into these
+MOST_LOGGED = 2**20     # words of the log that keep their pages when it is empty: 8 MB
 
 
 class Memory:
@@ -307,6 +308,12 @@ class Memory:
         The head stays the same array: who has it must not go on with tables that are freed.
         """
         self.head[:], self._tables = other.head, other._tables  # noqa: SLF001
+
+    def clear_log(self) -> None:
+        """Give the pages of the log back, which is empty, after an update of a large part."""
+        if self.head[LOGGED] > MOST_LOGGED:
+            self._tables['log'].base.obj.madvise(mmap.MADV_DONTNEED)  # type: ignore[union-attr]
+            self.head[LOGGED] = 0
 
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
         """Make a table grow to at least a given number of rows, else raise LinearSolveError."""

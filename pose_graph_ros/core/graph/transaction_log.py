@@ -170,6 +170,7 @@ def commit(head):  # type: ignore[no-untyped-def]
         else:
             row = tb.cliques(head)[c]
             pools.give(head, pools.VALUES, values, pools.n_values(row.n_frontal, row.n_separator))
+    head[tb.LOGGED] = max(head[tb.LOGGED], head[tb.LOG_END])
     head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
