@@ -24,7 +24,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph_update import Gone
-from pose_graph_ros.core.graph.pools import separator
+from pose_graph_ros.core.graph.pools import is_among, separator
 from pose_graph_ros.core.graph.rows import touch
 
 # Results of `add_rows`.
@@ -48,7 +48,8 @@ def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
         clique = tb.cliques(head)[c]
         n_nodes = clique.n_frontal + clique.n_separator
         members = tb.pool_i(head)[clique.members:clique.members + n_nodes]
-        if i in members and (j < 0 or j in members) and (k < 0 or k in members):
+        if (is_among(i, members) and (j < 0 or is_among(j, members))
+                and (k < 0 or is_among(k, members))):
             return True
     return False
 
@@ -252,7 +253,8 @@ def touch_with(head, v, spared):  # type: ignore[no-untyped-def]
         depth -= 1
         c = cliques[stack[depth]].child
         while c >= 0:
-            if cliques[c].n_frontal > 0 and not spared[c] and v in separator(head, c):
+            if cliques[c].n_frontal > 0 and not spared[c] and is_among(
+                    v, separator(head, c)):
                 touch(head, tb.pool_i(head)[cliques[c].members])
                 stack[depth] = c
                 depth += 1

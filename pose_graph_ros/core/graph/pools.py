@@ -52,6 +52,15 @@ def update_matrix(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def is_among(v, members):  # type: ignore[no-untyped-def]
+    """Tell whether a node is in a list; `v in members` would load the linear algebra of Numba."""
+    found = False
+    for u in members:
+        found = found or u == v
+    return found
+
+
+@kernel
 def product(update, size, x, minus, out):  # type: ignore[no-untyped-def]
     """
     Write U x, less `minus` times u; U is an upper triangle laid out by `row_start`.

@@ -261,7 +261,7 @@ def remove_of_node(head, v):  # type: ignore[no-untyped-def]
     """Take all priors on a node out of the graph."""
     cliques = tb.cliques(head)
     for c in all_priors(head):
-        if v not in pools.separator(head, c):
+        if not pools.is_among(v, pools.separator(head, c)):
             continue
         transaction_log.log_clique(head, c)
         _touch_nodes(head, c, -1.0)
