@@ -8,6 +8,7 @@ its arguments are known to be right, as the imports take up to seconds.
 """
 
 import argparse
+import atexit
 from collections.abc import Callable
 import gc
 import importlib
@@ -34,6 +35,9 @@ def main(args: list[str] | None = None) -> int:
         prog='pose-graph', description='Tools around the pose graph node.')
     parser.add_argument('--version', action='version', version=__version__)
     words = sys.argv[1:] if args is None else args
+    if args is None:    # the process is ours
+        gc.set_threshold(100_000)   # what is read makes many objects, and none of them waste
+        atexit.register(gc.freeze)  # else the interpreter looks at each object again as it ends
     # of the others not even the arguments are loaded, which takes as long as a small graph
     named = words[:1] if len(words) > 0 and words[0] in TOOLS else [*TOOLS]
     tools = parser.add_subparsers(title='tools', required=True, dest='tool', metavar=(

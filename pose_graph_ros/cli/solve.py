@@ -12,7 +12,6 @@ import argparse
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
-import json
 from pathlib import Path
 import re
 import sys
@@ -25,7 +24,7 @@ from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.cli.solved_graph import SolvedGraph
-from pose_graph_ros.core import config, sparse
+from pose_graph_ros.core import sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
 from pose_graph_ros.core.exceptions import ConfigError, LinearSolveError, PoseGraphError
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 N_LARGEST = 5  # edges, observed nodes, and names, that are printed
 COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
            'cov_thetatheta')
-CONFIG = config.SolverConfig(max_iterations=200)
 MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
@@ -145,8 +143,7 @@ def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
 def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     if problem.plain is not None and start in {'chordal', 'present'}:
         problem.plain.set_poses(poses)
-        found = problem.plain.optimize(
-            CONFIG, Start.CHORDAL if start == 'chordal' else Start.PRESENT)
+        found = problem.plain.optimize(Start.CHORDAL if start == 'chordal' else Start.PRESENT)
         if found is not None:
             return Solution(found, found.start.value, True, (), problem.plain)
     # loads the compiled kernels
@@ -163,7 +160,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
         poses[~graph.is_pose, 2] = 0.0
     graph.set_poses(poses)
     optimize = (optimizer.optimize_from_linear_start if start == 'chordal' else optimizer.optimize)
-    result, determined = _held_weakly(graph, optimize)
+    result, determined = _held_weakly(graph, partial(optimize, config=optimizer.PATIENT))
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
                     result.reason)
     # where it failed, the poses are those before, but all linear starts were tried
@@ -174,7 +171,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
 
 
 def _held_weakly(
-    graph: 'Graph', optimize: Callable[['Graph', config.SolverConfig], BatchResult],
+    graph: 'Graph', optimize: Callable[['Graph'], BatchResult],
 ) -> tuple[BatchResult, bool]:
     """
     Optimise a graph; if poses are not determined, choose those near the present ones.
@@ -182,7 +179,7 @@ def _held_weakly(
     The result has the reason then. It is the minimum of chi2 with a weak prior on each node, which
     is not added to the graph. Also return whether the poses are determined.
     """
-    result = optimize(graph, CONFIG)
+    result = optimize(graph)
     if result.status is not Status.FAILED or not np.isfinite(result.chi2):
         return result, True
     copy, n = type(graph)(), graph.n_nodes
@@ -192,7 +189,7 @@ def _held_weakly(
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
     copy.apply(graph_update.GraphUpdate(factors=constraints.Factors.on(
         np.arange(n), None, graph.poses.copy(), weak, [constraints.FactorKind.GLOBAL_POSE] * n)))
-    other = optimize(copy, CONFIG)
+    other = optimize(copy)
     if other.status is Status.FAILED:
         return result, False
     graph.set_poses(copy.poses)
@@ -333,6 +330,8 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         draw_solved(problem.solved(poses, before, solution.result, doubted),
                     options.picture, options.graph.name)
     if options.json:
+        import json
+
         graph, result = problem.graph, solution.result
         edges = graph.factors_at(doubted)
         print(json.dumps(finite({
@@ -411,14 +410,14 @@ def _marginals(problem: Problem, solution: Solution,
     The heading of a point is None. With them comes the relative error that rounding may make: the
     condition number times epsilon.
     """
-    from pose_graph_ros.core.batch.optimizer import optimize
+    from pose_graph_ros.core.batch.optimizer import optimize, PATIENT
     from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
     if solution.result.status is Status.FAILED or not solution.determined:
         raise PoseGraphError(f'--marginals: {solution.result.reason}')
     graph = problem.engine
     # H at the optimum; the last step before it was linearised one step away
-    optimize(graph, CONFIG)
+    optimize(graph, PATIENT)
     covariances = IncrementalSmoother(graph=graph).covariances()
     table = []
     for row, pose, numbers in zip(rows.tolist(), graph.poses[rows].tolist(),

@@ -22,7 +22,7 @@ from pose_graph_ros.cli.run.document import Told
 from pose_graph_ros.cli.run.findings import Finding, MANY, MOST_SHOWN
 from pose_graph_ros.cli.run.sources import source_entry, SourceAnalysis, verdict
 from pose_graph_ros.cli.solved_graph import SolvedGraph
-from pose_graph_ros.core.batch.optimizer import optimize, Status
+from pose_graph_ros.core.batch.optimizer import optimize, PATIENT, Status
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -67,7 +67,7 @@ def solved_document(path: Path, edge2: str | None, robust: str | None) -> dict[s
         len(factors) > 0)
     if is_determined:
         # H at the optimum; the last step before it was linearised one step away
-        optimize(graph, solve.CONFIG)
+        optimize(graph, PATIENT)
         smoother = IncrementalSmoother(graph=graph)
         covariances = smoother.covariances()[solved.is_pose]
         analyses = _analyses(smoother, rows, times[:, 1])

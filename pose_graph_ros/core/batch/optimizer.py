@@ -33,6 +33,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
+# Of tools that run once.
+PATIENT = SolverConfig(max_iterations=200)
 # Numbers in the cliques of a graph up to which SuperLU looks for a start: it takes several times
 # their memory, more than 20 GB for a grid of 10^6 poses.
 MOST_VALUES = 100_000_000
@@ -41,9 +43,9 @@ MOST_VALUES = 100_000_000
 LEAST_HEADING = 1e-10
 
 __all__ = [
-    'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Start', 'Status',
-    'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start', 'optimize_from_two_starts',
-    'plant', 'to_the_end']
+    'PATIENT', 'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Start',
+    'Status', 'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start',
+    'optimize_from_two_starts', 'plant', 'to_the_end']
 
 
 def optimize(graph: Graph, config: SolverConfig,

@@ -16,7 +16,6 @@ import numpy as np
 
 from pose_graph_ros.core.batch import levenberg_marquardt as lm
 from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, sparse_chordal
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
@@ -24,6 +23,10 @@ from pose_graph_ros.core.graph.checks import are_definite
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
 from pose_graph_ros.core.sparse import BlockFactors
+
+# Length of a further step below which it has converged [m, rad], as by default in `config`, whose
+# import takes as long as to solve a small graph.
+TOLERANCE = 1e-8
 
 
 class PlainGraph:
@@ -70,7 +73,7 @@ class PlainGraph:
         """Return the graph with the present poses."""
         return self._rows._replace(poses=self.poses.copy())
 
-    def optimize(self, config: SolverConfig, start: lm.Start) -> lm.BatchResult | None:
+    def optimize(self, start: lm.Start) -> lm.BatchResult | None:
         """
         Return the result of moving the poses to a minimum from a chordal start or where they are.
 
@@ -85,9 +88,7 @@ class PlainGraph:
                 if chi2 < np.inf:
                     if start is lm.Start.CHORDAL:
                         self.poses = chordal(self, sparse_chordal(self, self.nodes))
-                    result = lm.to_the_end(lm.minimize(
-                        self, config.step_tolerance,
-                        min(config.max_iterations, lm.TRUSTED_ITERATIONS)))
+                    result = lm.to_the_end(lm.minimize(self, TOLERANCE, lm.TRUSTED_ITERATIONS))
                     if lm.is_trusted(result, chi2):
                         return replace(result, start=start)
             except LinearSolveError:

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is assumed of receivers and of odometry: each number is a sentence about the world."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class BankSettings:
+class BankSettings(NamedTuple):
     """Meaning and unit of each number stand beside it."""
 
     # --- how often something goes wrong, and how far

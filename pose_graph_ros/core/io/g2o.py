@@ -52,7 +52,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import scaled
@@ -61,7 +60,6 @@ from pose_graph_ros.core.graph.checks import check, RowError
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
 from pose_graph_ros.core.io import g2o_text as gt
-from pose_graph_ros.core.odometry.motion import as_calibrated
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
@@ -161,6 +159,7 @@ def _spread(file: GraphFile) -> float:
     """Return the mean over the median of the energies of edges at the optimum."""
     # loads the compiled kernels
     from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start  # noqa: PLC0415
+    from pose_graph_ros.core.config import SolverConfig  # noqa: PLC0415
 
     # another graph than the one that is returned, with the rows as they were read
     optimize_from_linear_start(file.graph, SolverConfig())
@@ -364,6 +363,8 @@ def _parts(rows: GraphRows, ids: IntArray | None) -> Iterator[str]:
         for some in _blocks(np.flatnonzero(written & edges)):
             yield _factor_lines(factors.rows(some), ids, used[some])
     if np.any(calibrated):
+        # what it needs takes long to load as well
+        from pose_graph_ros.core.odometry.motion import as_calibrated  # noqa: PLC0415
         instead = as_calibrated(factors.rows(calibrated), rows.poses)
         yield (f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
                f'lines\n')
