@@ -139,10 +139,9 @@ class BlockFactors:
         if not np.array_equal(self._factors.perm_r, self._factors.perm_c):
             return False
         values, rows, starts = self._factors.U
-        columns = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-        # the arrays may have space behind the last column
-        pivots = values[:starts[-1]][rows[:starts[-1]] == columns]
-        return len(pivots) == len(starts) - 1 and bool(np.all(pivots.real > 0.0))
+        last = starts[1:] - 1   # the diagonal is the end of each column
+        return np.array_equal(rows[last], np.arange(len(last))) and bool(
+            np.all(values[last].real > 0.0))
 
     def solve(self, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return the solution for right-hand sides of the matrix's type, (n b,) or (n b, k)."""

@@ -161,6 +161,8 @@ class QuadraticForm:
         own = np.zeros((self.n, 1, 1))
         own[0] = self._pull
         self._laplacian = self._nodes.factors(self._by_t, self._by_t, own)
+        # headings with what was found for them, as f and its gradient are asked for one by one
+        self._last: tuple[ComplexArray, ComplexArray, ComplexArray] | None = None
 
     def factors(self, shift: FloatArray, *, turned: bool = True) -> BlockFactors:
         """
@@ -187,22 +189,24 @@ class QuadraticForm:
 
     def positions(self, z: ComplexArray) -> ComplexArray:
         """Return the best positions, shape (n, r), for headings of this shape; 0 of the map."""
-        return self._solved(z)[0]
-
-    def _solved(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the best positions, and what headings add to the residuals, shape (M, 2, r)."""
-        (i, j), (by_i, by_j) = self._ends, self._by[:, :, :, 1:]
-        of_headings = np.asarray(by_i * z[i, None] + by_j * z[j, None])
-        right = self._nodes.gathered(self._by_t, of_headings[:, :1])[:, 0]
-        # a complex column as two real ones
-        solved = self._laplacian.solve(-np.ascontiguousarray(right).view(np.float64))
-        return np.ascontiguousarray(solved).view(np.complex128), of_headings
+        return self._solved(z)[1]
 
     def residuals(self, z: ComplexArray) -> ComplexArray:
         """Return the whitened residuals of positions and headings, shape (M, 2, r)."""
-        (t, residuals), (i, j) = self._solved(z), self._ends
-        residuals[:, 0] += self._by_t[1][:, 0] * (t[j] - t[i])
-        return residuals
+        return self._solved(z)[2]
+
+    def _solved(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return headings, which must not change later, with their positions and residuals."""
+        if self._last is None or self._last[0] is not z:
+            (i, j), (by_i, by_j) = self._ends, self._by[:, :, :, 1:]
+            residuals = np.asarray(by_i * z[i, None] + by_j * z[j, None])
+            right = self._nodes.gathered(self._by_t, residuals[:, :1])[:, 0]
+            # a complex column as two real ones
+            solved = self._laplacian.solve(-np.ascontiguousarray(right).view(np.float64))
+            t = np.ascontiguousarray(solved).view(np.complex128)
+            residuals[:, 0] += self._by_t[1][:, 0] * (t[j] - t[i])
+            self._last = z, t, residuals
+        return self._last
 
     def cost(self, z: ComplexArray) -> float:
         """Return f for headings z of shape (n, r)."""

@@ -21,7 +21,6 @@ the cliques of a graph.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from itertools import product
 import math
 from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
@@ -127,10 +126,17 @@ class NodeSystem:
         self._pattern = BlockPattern(rows, columns, self.places)
 
     def factors(self, by: Ends, weighted: Ends, own: Blocks | None = None) -> BlockFactors:
-        """Return the factors of the sum of by^H weighted, and of blocks of the free nodes."""
+        """
+        Return the factors of the sum of by^H weighted, and of blocks of the free nodes.
+
+        What the residuals are weighted with has to be Hermitian.
+        """
         def blocks() -> Iterator[Blocks]:
-            for (a, b), kept in zip(product(by, weighted), self._kept, strict=True):
-                yield a[kept].conj().swapaxes(1, 2) @ b[kept]
+            (i, j), both = by, self._kept[1]
+            across = i[both].conj().swapaxes(1, 2) @ weighted[1][both]
+            yield i[self._kept[0]].conj().swapaxes(1, 2) @ weighted[0][self._kept[0]]
+            yield from (across, across.conj().swapaxes(1, 2))
+            yield j[self._kept[3]].conj().swapaxes(1, 2) @ weighted[1][self._kept[3]]
             size = by[0].shape[2]
             yield np.zeros((len(self.free), size, size)) if own is None else own
         return self._pattern.factors(blocks())

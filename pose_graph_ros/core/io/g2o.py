@@ -407,7 +407,8 @@ def _lines(tags: list[str], ids: IntArray, numbers: FloatArray) -> list[str]:
     columns = [map(str, column) for column in ids.T.tolist()]
     # as integers, which tell 0.0 and -0.0 apart; those of the information are mostly the same
     for column in np.ascontiguousarray(numbers.T).view(np.int64):
-        each, place = np.unique(column, return_inverse=True)
+        each, place = ((column[:1], np.zeros_like(column)) if np.all(column == column[:1])
+                       else np.unique(column, return_inverse=True))
         texts = [*map(repr, each.view(np.float64).tolist())]
         columns.append(map(texts.__getitem__, place.tolist()))
     return [' '.join(words) + '\n' for words in zip(tags, *columns, strict=True)]
