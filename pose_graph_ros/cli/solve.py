@@ -314,6 +314,10 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
     poses = graph.poses.copy()
     solution, doubted, decision, certificate, proof, seconds = optimised(problem, options, say)
+    if problem.plain is None:
+        from pose_graph_ros.core.batch.optimizer import uproot
+
+        uproot(problem.engine)  # what follows needs memory as well
     say('\n'.join([*_lines(problem, solution, seconds, doubted), *proof]))
     table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
     text = '\n'.join([','.join(COLUMNS), *(','.join(

@@ -45,7 +45,7 @@ LEAST_HEADING = 1e-10
 __all__ = [
     'PATIENT', 'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Start',
     'Status', 'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start',
-    'optimize_from_two_starts', 'plant', 'to_the_end']
+    'optimize_from_two_starts', 'plant', 'to_the_end', 'uproot']
 
 
 def optimize(graph: Graph, config: SolverConfig,
@@ -185,6 +185,13 @@ def plant(graph: Graph, cliques: symbolic.Cliques) -> None:
     memory.ensure('pool_i', max(cliques.need_i, int(keep_i)), keep=int(keep_i))
     memory.ensure('work_f', cliques.largest)
     symbolic.plant_all(memory.head, cliques)
+
+
+def uproot(graph: Graph) -> None:
+    """Let go of the cliques and their values, half of all memory; the poses stay."""
+    if graph.n_priors == 0:     # whose values are among them
+        editing.restart(graph.memory.head)
+        graph.memory.empty('pool_f')
 
 
 def chi2_of(graph: Graph) -> float:

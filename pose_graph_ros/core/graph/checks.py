@@ -115,7 +115,8 @@ def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
     """Raise if a factor has a node of the wrong kind for an end, or lacks one."""
     for each, factor in FACTORS.items():
         rows = factors.kind == each
-        for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)):
+        for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)
+                             ) if np.any(rows) else ():
             node = getattr(factors, end)
             wrong = rows & np.where(
                 node >= 0, ~np.isin(kind[ids.rows(node)], allowed), end == 'j' and allowed != ())

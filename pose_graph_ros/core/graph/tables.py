@@ -315,6 +315,11 @@ class Memory:
             self._tables['log'].base.obj.madvise(mmap.MADV_DONTNEED)  # type: ignore[union-attr]
             self.head[LOGGED] = 0
 
+    def empty(self, name: str) -> None:
+        """Let go of what a table holds, and start it anew with few rows."""
+        del self._tables[name]
+        self.ensure(name, FIRST_ROWS)
+
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
         """Make a table grow to at least a given number of rows, else raise LinearSolveError."""
         at = 2 * NAMES.index(name)

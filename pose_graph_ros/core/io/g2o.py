@@ -54,9 +54,8 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.covariance import scaled
 from pose_graph_ros.core.geometry.se2 import BoolArray, compose_one, FloatArray, IntArray, Pose
-from pose_graph_ros.core.graph.checks import check, RowError
+from pose_graph_ros.core.graph.checks import are_definite, check, RowError
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
 from pose_graph_ros.core.io import g2o_text as gt
@@ -121,7 +120,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    text = gt.lines_of(path, gt.read_text(path))
+    text = gt.read(path)
     if edge2_order is not None or not any(len(text.rows[tag]) for tag in gt.AMBIGUOUS):
         return _graph_of(text, edge2_order)
     files: dict[str, GraphFile] = {}
@@ -140,9 +139,8 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 def _likelier(files: dict[str, GraphFile]) -> tuple[str, str]:
     """Return in which order the numbers of a file make more sense, and why."""
-    # by the smallest eigenvalue of a matrix, its diagonal scaled to 1
-    definite = [order for order, file in files.items() if np.min(np.linalg.eigvalsh(
-        scaled(file.rows.factors.edges.information)), initial=1.0) > 1e-9]
+    definite = [order for order, file in files.items()
+                if np.all(are_definite(file.rows.factors.edges.information))]
     if len(definite) == 1:
         other = next(order for order in EDGE2_ORDERS if order != definite[0])
         return definite[0], (
@@ -175,8 +173,9 @@ def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     n_loops, loops = 0, tuple[str, ...]()
     for tag, table in text.rows.items():
         if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
-            rows[tag] = table[table['ids'][:, 0] != table['ids'][:, 1]]
-            n_loops += len(table) - len(rows[tag])
+            is_loop = table['ids'][:, 0] == table['ids'][:, 1]
+            if np.any(is_loop):
+                n_loops, rows[tag] = n_loops + int(np.sum(is_loop)), table[~is_loop]
     if n_loops > 0:
         loops = (f'{n_loops} edges from a node to itself are skipped',)
     rows['LANDMARK'], notes = _numbered(text, rows)
@@ -196,7 +195,7 @@ def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
             f'{text.where(lines[again])}: vertex {names[again]} is in the file twice')
     factors = Factors.joined([
         factors_of(tag, rows[tag], order if tag in gt.AMBIGUOUS else '', ids)
-        for tag in gt.MEASURED])
+        for tag in gt.MEASURED if len(rows[tag]) > 0])
     is_landmark = np.isin(ids, rows['VERTEX_XY']['ids'])
     is_landmark[factors.j[np.isin(factors.kind, _TO_LANDMARKS)]] = True
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)

@@ -7,11 +7,11 @@ All lines of a tag are converted together. Only if that fails are they checked o
 number of the first line that is wrong and the reason.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+import io
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, IO, NamedTuple, NoReturn
 import warnings
 
 import numpy as np
@@ -79,31 +79,32 @@ class GraphText:
         return f'{self.path}:{line}'
 
 
-def read_text(path: Path) -> str:
-    """Return the text of a file, also of one that gzip has compressed."""
+def read(path: Path) -> GraphText:
+    """Return what is in a file, also of one that gzip has compressed; FileFormatError as below."""
     try:
-        content = path.read_bytes()
-        if content.startswith(_GZIP):
-            import gzip  # noqa: PLC0415
+        with path.open('rb') as file:
+            content: IO[bytes] = file
+            if file.peek(len(_GZIP)).startswith(_GZIP):
+                import gzip  # noqa: PLC0415
 
-            try:
-                content = gzip.decompress(content)
-            except Exception as error:  # of gzip, of zlib or of struct
-                raise OSError(error) from error
-        return content.decode('utf-8')
+                try:
+                    content = io.BytesIO(gzip.decompress(file.read()))
+                except Exception as error:  # of gzip, of zlib or of struct
+                    raise OSError(error) from error
+            return lines_of(path, io.TextIOWrapper(content, 'utf-8'))
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(f'{path}: cannot be read as text ({error})') from error
 
 
-def lines_of(path: Path, text: str) -> GraphText:
-    """Return what is in the text of a file; FileFormatError with the line if one is malformed."""
+def lines_of(path: Path, file: IO[str]) -> GraphText:
+    """Return what is in a file of text; FileFormatError with the line if one is malformed."""
     tables: dict[str, list[Lines]] = {tag: [_lines([], [], tag)] for tag in TAGS}
     skipped: dict[str, list[list[str]]] = {}
     first = 1
-    for block in _blocks(text):
+    # so that not all lines are objects at once, nor the whole text is in memory
+    while len(contents := file.readlines(_BLOCK)) > 0:
         # of each line the text, and its number
         found: dict[str, tuple[list[str], list[int]]] = {tag: ([], []) for tag in TAGS}
-        contents = block.splitlines()
         for line, content in enumerate(contents, first):
             words = content.split(None, 1)
             tag = words[0] if len(words) > 0 else '#'
@@ -136,15 +137,6 @@ def lines_of(path: Path, text: str) -> GraphText:
     if not any(len(some) for tag, some in rows.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
     return GraphText(path, rows, {tag: len(each) for tag, each in skipped.items()})
-
-
-def _blocks(text: str) -> Iterator[str]:
-    """Yield a text in parts of whole lines, so that not all of them are objects at once."""
-    begin = 0
-    while begin < len(text):
-        end = text.find('\n', begin + _BLOCK) + 1 or len(text)
-        yield text[begin:end]
-        begin = end
 
 
 def _lines(contents: list[str], lines: list[int], tag: str) -> Lines:

@@ -16,6 +16,7 @@ the path for other programs and is not read. See docs/design.md, "Saved graphs".
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 import hashlib
+import io
 import json
 import os
 from pathlib import Path
@@ -165,7 +166,7 @@ def read_graph(path: Path, folder: Path | None = None) -> SavedGraph:
         rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS}
         rows: SavedRows = sc.decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
-        return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
+        return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, io.StringIO(text))), **rest)
     except sc.MISMATCHES as error:
         raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
 
