@@ -117,9 +117,9 @@ class Problem:
 
 def solve(problem: Problem, start: str) -> Solution:
     """Return the result of optimising a graph in place."""
-    present, found = problem.graph.poses.copy(), list[tuple[Solution, FloatArray]]()
     if start != 'best':
-        return _solve_from(problem, start, present)
+        return _solve_from(problem, start, problem.graph.poses.copy())
+    present, found = problem.graph.poses.copy(), list[tuple[Solution, FloatArray]]()
     # poses that were composed from edges are those of odometry
     names = [name for name in STARTS if name != 'best' and (name != 'file' or problem.has_start)]
     for name in names:
@@ -159,6 +159,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
         compose_missing(poses, known, steps if joins_all else edges)
         poses[~graph.is_pose, 2] = 0.0
     graph.set_poses(poses)
+    del poses   # a large graph has its own copies while it is optimised
     optimize = (optimizer.optimize_from_linear_start if start == 'chordal' else optimizer.optimize)
     result, determined = _held_weakly(graph, partial(optimize, config=optimizer.PATIENT))
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
