@@ -321,3 +321,17 @@ def test_a_graph_too_large_for_superlu_has_the_other_starts(monkeypatch) -> None
     assert (result.status, result.start) == (Status.CONVERGED, Start.PRESENT)
     graph.apply(GraphUpdate(factors=random_observed(np.random.default_rng(0), [1, 5])))
     assert optimizer.optimize_from_two_starts(graph, THOROUGH).status is Status.CONVERGED
+
+
+def test_a_graph_without_its_cliques_is_as_good_as_before() -> None:
+    graph = corridor_graph(1, 0.01)
+    result = optimizer.optimize(graph, SolverConfig())
+    poses = graph.poses.copy()
+    optimizer.uproot(graph)
+    np.testing.assert_array_equal(graph.poses, poses)
+    assert graph.energies().chi2 == pytest.approx(result.chi2, rel=SAME_CHI2)
+    # online and as a whole it goes on
+    smoother = IncrementalSmoother(graph=graph)
+    smoother.extend(np.array([1.0, 0.0, 0.0]), np.eye(3))
+    assert optimizer.optimize(graph, SolverConfig()).chi2 == pytest.approx(
+        result.chi2, rel=SAME_CHI2)

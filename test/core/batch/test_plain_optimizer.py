@@ -10,7 +10,7 @@ from random_graphs import corridor_graph
 
 from pose_graph_ros.core.batch.levenberg_marquardt import Start, Status
 from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start
-from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
+from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, TOLERANCE
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -18,6 +18,10 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 CONFIG = SolverConfig(max_iterations=200)
+
+
+def test_its_tolerance_is_that_of_the_parameters() -> None:
+    assert CONFIG.step_tolerance == TOLERANCE
 
 
 def noisy_graph(seed: int, n: int = 30, noise: float = 0.1) -> Graph:
@@ -44,7 +48,7 @@ def test_the_optimum_is_that_of_the_compiled_optimiser(seed: int) -> None:
     graph = noisy_graph(seed)
     plain = PlainGraph(graph.rows())
     assert plain.energies().chi2 == pytest.approx(graph.energies().chi2, rel=1e-12)
-    result = plain.optimize(CONFIG, Start.CHORDAL)
+    result = plain.optimize(Start.CHORDAL)
     expected = optimize_from_linear_start(graph, CONFIG)
     if result is None:
         # what is not simple is left to the other one
@@ -65,7 +69,7 @@ def test_a_hard_graph_is_left_to_the_other_optimiser() -> None:
     graph = corridor_graph(1, sigma=0.3)
     plain = PlainGraph(graph.rows())
     before: FloatArray = plain.poses.copy()
-    assert plain.optimize(CONFIG, Start.CHORDAL) is None
+    assert plain.optimize(Start.CHORDAL) is None
     np.testing.assert_array_equal(plain.poses, before)
 
 
@@ -99,7 +103,7 @@ def test_what_overflows_is_no_result_and_no_warning(start: Start) -> None:
             edges.replaced(information=scale * edges.information, mean=mean),
             graph.factors.observed])))
         before = plain.poses.copy()
-        if plain.optimize(CONFIG, start) is None:
+        if plain.optimize(start) is None:
             refused += 1
             np.testing.assert_array_equal(plain.poses, before)
         assert np.all(np.isfinite(plain.poses))
