@@ -12,7 +12,8 @@ are beyond what the process had before, with the world that it has made.
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import contextlib
+import io
 from itertools import product
 import json
 from pathlib import Path
@@ -28,6 +29,7 @@ import numpy as np
 from benchmark import ours, partition, worlds
 from benchmark.parts import resident_bytes
 from benchmark.worlds import World
+from pose_graph_ros.cli import main as cli
 from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.elimination import assembly, symbolic
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -46,7 +48,7 @@ FEW_STEPS = 200
 class Figures(dict[str, Any]):
     """What was measured, by name."""
 
-    @contextmanager
+    @contextlib.contextmanager
     def timed(self, name: str) -> Iterator[None]:
         """Note the processor time of what is done."""
         begin = time.process_time()
@@ -116,6 +118,15 @@ def files(world: World, figures: Figures) -> None:
             read_g2o(path)
 
 
+def solve(world: World, figures: Figures) -> None:
+    """Measure `pose-graph solve` of such a file from dead reckoning, without the certificate."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, 'graph.g2o')
+        write_g2o(world.graph(world.dead_reckoning()), path)
+        with figures.timed('solve'), contextlib.redirect_stdout(io.StringIO()):
+            cli.main(['solve', str(path), '-o', str(path), '--no-certificate'])
+
+
 def _truth(world: World) -> FloatArray:
     assert world.truth is not None
     return world.truth
@@ -151,7 +162,7 @@ def online(world: World, figures: Figures) -> None:
 
 
 PARTS = {part.__name__: part for part in (
-    structure, batch, linear_start, marginals, files, online)}
+    structure, batch, linear_start, marginals, files, solve, online)}
 
 
 def peak_bytes() -> int:

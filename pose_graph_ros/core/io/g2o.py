@@ -336,7 +336,7 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
 def _parts(rows: GraphRows, ids: IntArray | None) -> Iterator[str]:
     """Yield the text in parts, so that not all of its lines are objects at once."""
     ids = rows.node_ids if ids is None else ids
-    factors = rows.factors.renumbered(rows.rows_of)
+    factors = rows.factors
     used = factors.weight > 0.0
     # a measurement with a correlated error has weight 0; an edge from its node to a bias holds it
     to_bias = factors.rows((factors.kind == FactorKind.BIAS) & used)
@@ -346,7 +346,8 @@ def _parts(rows: GraphRows, ids: IntArray | None) -> Iterator[str]:
     is_edge, n_biases = factors.j >= 0, int(np.sum(rows.is_bias))
     written = np.where(
         is_edge, np.isin(factors.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
-        & ~np.any(factors.constants, axis=1) & (factors.k < 0), ~rows.is_bias[factors.i])
+        & ~np.any(factors.constants, axis=1) & (factors.k < 0),
+        ~rows.is_bias[rows.rows_of(factors.i)])
     calibrated = (factors.kind == FactorKind.ODOMETRY) & (factors.k >= 0)
     n_edges = np.sum(is_edge & ~written & ~calibrated)
     if n_edges > 0 or n_biases > 0:
@@ -360,11 +361,12 @@ def _parts(rows: GraphRows, ids: IntArray | None) -> Iterator[str]:
     yield ''.join(f'FIX {name}\n' for name in ids[rows.fixed & ~rows.is_bias].tolist())
     for edges in (is_edge, ~is_edge):
         for some in _blocks(np.flatnonzero(written & edges)):
-            yield _factor_lines(factors.rows(some), ids, used[some])
+            yield _factor_lines(factors.rows(some).renumbered(rows.rows_of), ids, used[some])
     if np.any(calibrated):
         # what it needs takes long to load as well
         from pose_graph_ros.core.odometry.motion import as_calibrated  # noqa: PLC0415
-        instead = as_calibrated(factors.rows(calibrated), rows.poses)
+        instead = as_calibrated(
+            factors.rows(calibrated).renumbered(rows.rows_of), rows.poses)
         yield (f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
                f'lines\n')
         yield _factor_lines(instead, ids, used[calibrated])
