@@ -95,7 +95,7 @@ def dissected(world: World, graph: Graph, by_degree: symbolic.Cliques) -> symbol
     # all nodes are those that are eliminated last, in their order
     return symbolic.Cliques(*symbolic.in_postorder(
         order, ordering.minimum_degree(len(order), 0, 0, len(order), start, adjacency), 0,
-        symbolic.RELAXED_ZEROS, symbolic.RELAXED_FRONTAL, True))
+        symbolic.RELAXED_ZEROS, symbolic.RELAXED_FRONTAL))
 
 
 def _halved(nodes: IntArray, edges: IntArray, poses: FloatArray, side: Any) -> Iterator[IntArray]:
