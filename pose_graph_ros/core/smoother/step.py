@@ -79,7 +79,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         head[tb.STRUCTURE] = 0
         forget_touched(head)
         head[tb.N_ELIMINATED] += len(affected)
-        error2 = _solve_and_check(head)
+        back_substitute(head)
+        error2 = check(head)
         if tree_update.interrupted(head):
             return tree_update.INTERRUPTED
         settled = leave_over(head, error2)
@@ -128,7 +129,8 @@ def _iterate(head):  # type: ignore[no-untyped-def]
         return code
     forget_touched(head)
     head[tb.N_ELIMINATED], head[tb.SINCE] = len(affected), head[tb.REFINED]
-    _solve_and_check(head)
+    back_substitute(head)
+    check(head)
     # Gauss-Newton goes uphill, by at most 1 sigma^2, where it swings a soft mode
     if not scalars.chi2 <= scalars.lowest + 1.0 or head[tb.ROUND] >= 20:
         return tree_update.DIVERGED
@@ -160,7 +162,8 @@ def refine(head):  # type: ignore[no-untyped-def]
         tb.work_i(head)[0] = c
         head[tb.N_ROOTS], head[tb.SINCE] = 1, head[tb.REFINED]
         head[tb.ITERATION] += 1
-        _solve_and_check(head)
+        back_substitute(head)
+        check(head)
         head[tb.ROUND], scalars.lowest = 0, scalars.chi2
     if tree_update.interrupted(head):
         return tree_update.INTERRUPTED
@@ -261,13 +264,6 @@ def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
     return min(scalars.budget, scalars.share * scalars.n_moved)
-
-
-@kernel
-def _solve_and_check(head):  # type: ignore[no-untyped-def]
-    """Solve from the roots on the stack down; return the sum that `check` does."""
-    back_substitute(head)
-    return check(head)
 
 
 @kernel
