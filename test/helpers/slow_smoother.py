@@ -406,7 +406,8 @@ class World:
     def leaving(self, graph: SlowGraph) -> GraphUpdate:
         """Return an update that nodes and constraints leave the graph with, all but one pose."""
         rng, poses, update = self.rng, self.poses, GraphUpdate()
-        nodes = [*poses, *self.biases - self.gone]
+        nodes = [*poses, *(bias for bias in sorted(self.biases - self.gone)
+                           if bias < len(self.truth))]     # of updates that have not failed
         kept = int(rng.choice(poses))
         if rng.random() < 0.8:
             chosen = rng.choice(nodes, min(int(rng.integers(1, 5)), len(nodes)), replace=False)
