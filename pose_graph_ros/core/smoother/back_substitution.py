@@ -27,6 +27,9 @@ from pose_graph_ros.core.smoother.tree_update import interrupted
 
 # Energy of a constraint that is assumed to predict its linearization error from a turn [sigma^2].
 USUAL_ENERGY = 0.1
+# Fraction of `budget_share` from which on the error of a turned frame is computed: in a long chain
+# many small ones add up.
+SLIP_FRACTION = 0.1
 # Fraction of alpha that limits the moves of nodes and the drift of cliques where nothing below is
 # tied to the map: there the effect of a move that is not passed down does not decay.
 FREE_FRACTION = 0.35
@@ -270,7 +273,8 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                 if code != _AS_IT_IS or refines:    # no turn nor slip if it is anchored
                     row.turn = clique_frames.present_turn(head, child)
                     slip2 = (row.turn - row.turn_seen - turn)**2
-                    if slip2 * (slip2 * row.slip_scale + USUAL_ENERGY) > scalars.share:
+                    error2 = slip2 * (slip2 * row.slip_scale + USUAL_ENERGY)
+                    if error2 > SLIP_FRACTION * scalars.share:
                         turned[head[tb.N_TURNED]] = child
                         head[tb.N_TURNED] += 1
                 if code == _SOLVED:
