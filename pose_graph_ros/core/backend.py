@@ -83,8 +83,7 @@ class PoseGraphBackend:
         self._refiner = Refiner(self.parts, self._tuner)
         self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
-        self._chi2_due, self._counts_due = parts.Turns(), parts.Turns()
-        self._counts = parts.Counts()
+        self._chi2_due = parts.Turns()
         self._waits = False  # whether the queue waits until the graph is solved
         # most constraints that the next update adds; and the number of updates that were
         # interrupted since one has added all that waits
@@ -410,10 +409,8 @@ class PoseGraphBackend:
         """Return the estimate, None before the first odometry; its path takes linear time."""
         if self.graph.n_nodes == 0:
             return None
-        if with_path or self._counts_due(self.graph.n_nodes):
-            self._counts = parts.counts(self.graph)
-        return parts.estimate(self.parts, self._newest_node_covariance, self._chi2, self._counts,
-                              with_path=with_path)
+        return parts.estimate(
+            self.parts, self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `core.parts`."""

@@ -111,7 +111,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.pipeline.queue += saved.waiting
         parts.quarantine.extend(saved.set_aside)
         parts.reweighting.cost(parts.graph)
-        estimate(parts, saved.newest_covariance, saved.chi2, counts(parts.graph), with_path=True)
+        estimate(parts, saved.newest_covariance, saved.chi2, with_path=True)
     except MISMATCHES as error:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
 
@@ -134,20 +134,7 @@ class Turns:
         return is_due
 
 
-class Counts(NamedTuple):
-    """What is counted in the whole graph."""
-
-    edges: int = 0
-    biases: int = 0
-
-
-def counts(graph: Graph) -> Counts:
-    """Return what takes linear time to count."""
-    return Counts(graph.n_edges, int(np.count_nonzero(graph.is_bias)))
-
-
-def estimate(parts: Parts, cov: FloatArray, chi2: float, counted: Counts, *,
-             with_path: bool) -> Estimate:
+def estimate(parts: Parts, cov: FloatArray, chi2: float, *, with_path: bool) -> Estimate:
     """Return the present estimate, given the covariance of the newest hidden node."""
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
     state, sigma = parts.alignment.state, parts.alignment.sigma
@@ -183,9 +170,9 @@ def estimate(parts: Parts, cov: FloatArray, chi2: float, counted: Counts, *,
         alignment=state, chi2=chi2, alignment_sigma=(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
         n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=nodes.n_thinned,
-        n_priors=graph.n_priors, n_edges=counted.edges,
+        n_priors=graph.n_priors, n_edges=graph.n_edges,
         n_observed=sum(len(each) + each.n_otherwise for each in factors.sources.values()),
-        n_biases=counted.biases,
+        n_biases=graph.n_biases,
         primary=nodes.primary, odometry=factors.config.odometry_source(nodes.primary),
         odometry_errors=nodes.errors if errors == AS_CLAIMED else nodes.errors._replace(
             rate=errors.rate, scale=errors.scale),

@@ -22,7 +22,7 @@ from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.graph.constraints import FACTORS, NodeKind
 from pose_graph_ros.core.graph.graph_update import Gone
 from pose_graph_ros.core.graph.pools import is_among, separator
 from pose_graph_ros.core.graph.rows import touch
@@ -31,6 +31,8 @@ from pose_graph_ros.core.graph.rows import touch
 ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
+# By kind, whether factors are between nodes that are no biases.
+_ARE_EDGES = np.array([factor.j not in {(), (NodeKind.BIAS,)} for factor in FACTORS.values()])
 NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
 
 
@@ -135,7 +137,7 @@ def set_fixed(head, chosen, fixed):  # type: ignore[no-untyped-def]
             nodes[v].fixed = 1 if fixed else 0
 
 
-def find_ends(memory: tb.Memory) -> None:
+def find_newest_and_fixed(memory: tb.Memory) -> None:
     """Note the newest pose and the first fixed node, of those that do not leave."""
     nodes = memory['nodes'][:memory.head[tb.N_NODES]]
     stays = nodes['factor_list'] != tb.LEAVES
@@ -174,10 +176,12 @@ def add_rows(head, values, types, records, checked):  # type: ignore[no-untyped-
         head[tb.STRUCTURE] = 1
         if nodes[v].kind == NodeKind.POSE:
             head[tb.NEWEST] = v
+        head[tb.N_BIASES] += nodes[v].kind == NodeKind.BIAS
     head[tb.N_FACTORS] = n_factors
     for e in range(n_factors - len(records), n_factors):
         f = tb.factors(head)[e]
         factors.prepare(f, f.kind)
+        head[tb.N_EDGES] += _ARE_EDGES[f.kind]
         f.error2 = f.energy = 0.0
         f.checked = f.waits = 0
         f.next[0], f.logged = -1, head[tb.UPDATE]
@@ -309,7 +313,9 @@ def compact(memory: tb.Memory) -> Gone:
         left = rows_now[memory[name][:head[counter]]]
         left = left[left >= 0]
         memory[name][:len(left)], head[counter] = left, len(left)
-    find_ends(memory)
+    find_newest_and_fixed(memory)
+    head[tb.N_BIASES] = np.count_nonzero(nodes['kind'] == np.uint8(NodeKind.BIAS))
+    head[tb.N_EDGES] = np.count_nonzero(_ARE_EDGES[factors['kind']])
     head[tb.N_LEAVING] = 0
     return Gone(nodes_gone, factors_gone)
 

@@ -25,9 +25,6 @@ COUNTERS = {'node': (tb.N_NODES, tb.NEXT_NODE), 'factor': (tb.N_FACTORS, tb.NEXT
 # By kind, whether factors have each column of `Factors.constants`.
 _HAS_CONSTANTS = np.array([np.isin(range(4), factor.constants) for factor in FACTORS.values()])
 
-# By kind, whether factors are between nodes that are no biases.
-_ARE_EDGES = np.array([factor.j not in {(), (NodeKind.BIAS,)} for factor in FACTORS.values()])
-
 
 class Graph:
     """
@@ -73,7 +70,12 @@ class Graph:
     @property
     def n_edges(self) -> int:
         """Number of factors between nodes that are no biases, removed ones included."""
-        return int(np.count_nonzero(_ARE_EDGES[self.factor_records['kind']]))
+        return int(self.memory.head[tb.N_EDGES])
+
+    @property
+    def n_biases(self) -> int:
+        """Number of hidden nodes that are biases."""
+        return int(self.memory.head[tb.N_BIASES])
 
     @property
     def n_priors(self) -> int:
@@ -315,7 +317,7 @@ class Graph:
         if len(update.remove_nodes) > 0:
             editing.remove_nodes(head, self.node_rows(update.remove_nodes))
         if any(map(len, (update.fix, update.free, update.remove_nodes))):
-            editing.find_ends(self.memory)
+            editing.find_newest_and_fixed(self.memory)
         if len(update.priors) > 0:
             self.ensure(self.n_nodes + len(update.priors), self.n_factors)
             add_priors(self.memory, update.priors, [

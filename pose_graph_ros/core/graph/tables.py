@@ -164,6 +164,7 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
 #   N_NODES, N_FACTORS, N_CLIQUES: rows in use; of cliques, unused rows included
+#   N_BIASES, N_EDGES: nodes that are biases, and factors between nodes that are none
 #   FREE_CLIQUE: first unused row of the cliques
 #   POOL_F_END, POOL_I_END: ends of what has ever been taken from the pools
 #   N_TOUCHED, N_FREED, N_WAITING: numbers of entries of `touched`, `freed` and `waiting`
@@ -190,12 +191,12 @@ WORD: Final = 8     # bytes; the size of a record is a multiple of it
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 # A rollback restores the first ones, up to LOOSE.
-(N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, FIXED, NEXT_NODE, NEXT_FACTOR,
- N_LEAVING, N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END,
- UPDATE, ITERATION, FRONT_SERIAL, LOGGED,
- NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
- N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
- REFINED, LISTED, ROUND, HEEDS, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 42)
+(N_NODES, N_FACTORS, N_BIASES, N_EDGES, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, FIXED,
+ NEXT_NODE, NEXT_FACTOR, N_LEAVING, N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END,
+ POOL_I_END, N_FREED, LOG_END, UPDATE, ITERATION, FRONT_SERIAL, LOGGED, NEED_F, NEED_I,
+ NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS,
+ N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE, REFINED, LISTED, ROUND, HEEDS,
+ COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 44)
 # Number of sizes of blocks in the pools, the largest of which have 2**31 numbers.
 N_SIZES: Final = 212
 # Heads of the free lists of pool_f and pool_i, one for each size.

@@ -141,6 +141,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     f.next[0], nodes[last].factor_list = nodes[last].factor_list, 4 * e
     f.next[1], nodes[v].factor_list = -1, 4 * e + 1
     head[tb.N_NODES], head[tb.N_FACTORS], head[tb.NEWEST] = v + 1, e + 1, v
+    head[tb.N_EDGES] += 1
     head[tb.NEXT_NODE] += 1
     head[tb.NEXT_FACTOR] += 1
     head[tb.LOG_END] = 0

@@ -156,6 +156,14 @@ class Edits(RuleBasedStateMachine):
         assert graph.fixed[row] if row >= 0 else not np.any(graph.fixed)
 
     @invariant()
+    def counts_its_edges_and_biases(self) -> None:
+        graph = self.smoother.graph
+        ends = graph.factor_records['ends'][:, :2]
+        joins_poses = (ends[:, 1] >= 0) & ~np.any(graph.is_bias[ends], axis=1)
+        assert graph.n_biases == np.count_nonzero(graph.is_bias)
+        assert graph.n_edges == np.count_nonzero(joins_poses)
+
+    @invariant()
     def has_the_covariances_of_its_linearization(self) -> None:
         graph = self.smoother.graph
         if graph.n_nodes == 0:
