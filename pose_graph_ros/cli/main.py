@@ -36,7 +36,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--version', action='version', version=__version__)
     words = sys.argv[1:] if args is None else args
     if args is None:    # the process is ours
-        gc.set_threshold(100_000)   # what is read makes many objects, and none of them waste
+        gc.set_threshold(100_000)   # reading makes many objects, and none of them is garbage
         atexit.register(gc.freeze)  # else the interpreter looks at each object again as it ends
     # of the others not even the arguments are loaded, which takes as long as a small graph
     named = words[:1] if len(words) > 0 and words[0] in TOOLS else [*TOOLS]

@@ -314,8 +314,8 @@ class SmootherConfig(Settings):
     POSITIVE = ('max_iterations',)
 
     alpha: float = 0.035  # back-substitution stops at nodes that move by less than this [sigma]
-    # Squared linearization error from which on the next step reduces what a step has left; of more
-    # than ten times as much, the step itself does so [sigma^2].
+    # Squared linearization error that a step may leave for good. What is above it, up to ten times
+    # as much, is left to the next step; above that the step iterates again [sigma^2].
     budget: float = 0.002
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
     budget_share: float = 2e-5

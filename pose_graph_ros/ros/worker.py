@@ -46,8 +46,8 @@ Job = Callable[[PoseGraphBackend], Result]
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
 GATHERING = 0.1
-# Where updates follow one another, what each leaves to a refinement is too little to be seen: it
-# is refined so long after the last time [s].
+# Time from one refinement to the next while updates follow one another: what each of them leaves
+# is too little to be seen [s].
 PAUSE = 1.0
 MOST_JOBS = 100  # of a kind that wait; the oldest is dropped
 

@@ -311,7 +311,7 @@ class Memory:
         self.head[:], self._tables = other.head, other._tables  # noqa: SLF001
 
     def clear_log(self) -> None:
-        """Give the pages of the log back, which is empty, after an update of a large part."""
+        """Give back the pages of the log, which is empty now, if an update has filled many."""
         if self.head[LOGGED] > MOST_LOGGED:
             self._tables['log'].base.obj.madvise(mmap.MADV_DONTNEED)  # type: ignore[union-attr]
             self.head[LOGGED] = 0
