@@ -285,13 +285,13 @@ class Worker:
         """Refine a little, while there is nothing else to do; publish moves that can be seen."""
         with self.watchdog.over(self._backend, 'a refinement'):
             result = self._backend.refine()
-        self._refine_at = 0.0
-        if result.finished:
-            self._refine_at, self._refined_at = math.inf, time.monotonic()
         self._refined += result.moved
         # it judges again, too; and a move that can be seen [m]
         if (result.finished and self._report(None, 0, whole=True) > 0) or self._refined > 1e-3:
             self._publish()
+        self._refine_at = 0.0
+        if result.finished:
+            self._refine_at, self._refined_at = math.inf, time.monotonic()
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
         """Do a job and answer it, unless the thread is to end."""

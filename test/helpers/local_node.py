@@ -4,6 +4,7 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
+import math
 from pathlib import Path
 import time
 from typing import Any
@@ -139,6 +140,8 @@ class Driver:
         worker, posted = self.session.worker, self.session.input.posted
         self.wait(lambda: worker.status.processed >= posted and worker.estimate is not None,
                   f'{posted} measurements are processed')
-        before = worker.estimate
+        before = worker.status.report
         worker.request_update()
-        self.wait(lambda: worker.estimate is not before, 'an update follows')
+        # it makes no new estimate if one by the timer has had all; the status is whole afterwards
+        self.wait(lambda: worker.status.report is not before and worker._refine_at == math.inf,
+                  'an update and a refinement follow')
