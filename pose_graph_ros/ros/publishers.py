@@ -49,6 +49,9 @@ TF_QOS = QoSProfile(depth=100)
 # Reading all of /tf costs as much as odometry: how long it is read, and the period of that [s].
 LISTENING, PAUSE = 2.0, 30.0
 
+# To ask who listens takes as long as to write a message: how often it is done [s].
+ASKING = 0.02
+
 LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
 UNPLACED = np.diag((
@@ -95,8 +98,7 @@ class Publishers:
                             for source in sources.source_list(values) if source.kind.in_map]
         self._awaits_map = False    # whether there ever was a publisher on one of these
         self._newest_ns = 0
-        # to ask who listens takes as long as to write a message: it is done with each estimate
-        self._asked: Estimate | None
+        self._asked_at = -math.inf
         self._wanted: list[Publisher] = []
         self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
@@ -113,7 +115,7 @@ class Publishers:
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
-        self._asked = None
+        self._asked_at = -math.inf
         self._waits = values['wait_for_map']
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = tuple(values['transform_slew'])
@@ -128,8 +130,8 @@ class Publishers:
         if stamp <= self._newest_ns or self._holds(estimate):
             return
         self._newest_ns = stamp
-        if estimate is not self._asked:
-            self._asked, self._wanted = estimate, [publisher for publisher in (
+        if (now := time.monotonic()) - self._asked_at >= ASKING:
+            self._asked_at, self._wanted = now, [publisher for publisher in (
                 self._pose, self._odometry, self._fix, *(
                     [] if self.transforms is None else [self.transforms.publisher]))
                 if publisher.get_subscription_count() > 0]

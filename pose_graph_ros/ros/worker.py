@@ -124,6 +124,11 @@ class Worker:
         self.thread.join(timeout)
         return not self.thread.is_alive()
 
+    @property
+    def is_refined(self) -> bool:
+        """Whether nothing is left to refine until the next update, and the status says so."""
+        return self._refine_at == math.inf
+
     def rest(self) -> tuple[PoseGraphBackend, Sequence[tuple[str, Measured]]]:
         """Return the engine and what it has not got, after the thread has ended."""
         return self._backend, self._inbox
@@ -275,11 +280,11 @@ class Worker:
         if self.estimate is None or stale or (report is not None and (
                 self._n_added + report.new_constraints + report.iterations > 0)):
             self._publish()
-        self._report(report, len(batch))
         if report is not None:
             # what is unfinished or to be tried is not put off
             self._refine_at = min(self._refine_at, 0.0 if (
                 report.status is not Status.CONVERGED) else self._refined_at + PAUSE)
+        self._report(report, len(batch))
 
     def _refine(self) -> None:
         """Refine a little, while there is nothing else to do; publish moves that can be seen."""

@@ -4,7 +4,6 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
-import math
 from pathlib import Path
 import time
 from typing import Any
@@ -143,5 +142,5 @@ class Driver:
         before = worker.status.report
         worker.request_update()
         # it makes no new estimate if one by the timer has had all; the status is whole afterwards
-        self.wait(lambda: worker.status.report is not before and worker._refine_at == math.inf,
+        self.wait(lambda: worker.status.report is not before and worker.is_refined,
                   'an update and a refinement follow')

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The outputs: what is published, when, and its stamps; with a stand-in for rclpy's node."""
 
+from itertools import count
 import math
+import time
 from types import SimpleNamespace as Space
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from harness import odometry, stamp_ns, TFMessage, yaw
+from harness import odometry, PATIENCE, stamp_ns, TFMessage, yaw
 from hypothesis import given as given_numbers, settings, strategies as st
 import numpy as np
 from rclpy.serialization import deserialize_message
@@ -207,6 +209,30 @@ def test_the_fix_needs_a_datum_and_a_measurement_in_the_map() -> None:
     assert (fix.latitude, fix.longitude) == pytest.approx((48.1, 11.6), abs=1e-9)
     assert fix.altitude == pytest.approx(500.0)
     assert fix.header.frame_id == 'base_link'
+
+
+def test_who_listens_from_later_on_is_heard_of_without_a_new_estimate() -> None:
+    given = Given()
+    outlets = given.node['pose'], given.node['odometry/filtered']
+    fixed, stamps = estimate(1.0), count(2)
+
+    def publish() -> None:
+        stamp_ns = next(stamps) * SECOND
+        given.out.publish_pose(fixed, odometry(stamp_ns / SECOND, 0.0, 0.0, 0.0),
+                               OdometrySample(stamp_ns, np.zeros(3)), given.datum)
+
+    for outlet in outlets:
+        outlet.listeners = 0
+    publish()
+    assert [outlet.sent for outlet in outlets] == [[], []]
+    for outlet in outlets:
+        outlet.listeners = 1
+    end = time.monotonic() + PATIENCE
+    while len(outlets[0].sent) == 0:
+        assert time.monotonic() < end, 'a subscriber of a robot that stands is never served'
+        publish()
+        time.sleep(0.002)
+    assert len(outlets[1].sent) == 1
 
 
 def test_the_path_is_published_once_for_each_estimate_and_only_for_a_subscriber() -> None:
