@@ -37,6 +37,7 @@ ENOUGH = 1e-10
 # Number of budgets that a step may leave to the next one, which eliminates most of these cliques
 # anyway.
 LEFT_OVER = 10.0
+RELATIVE = 3e-6
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
 SHARE = 1e-13
@@ -263,7 +264,8 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
-    return min(scalars.budget, scalars.share * scalars.n_moved)
+    most = max(scalars.budget, RELATIVE * min(scalars.chi2, float(head[tb.N_FACTORS])))
+    return min(most, scalars.share * scalars.n_moved)
 
 
 @kernel
@@ -291,7 +293,8 @@ def check(head):  # type: ignore[no-untyped-def]
             f.checked = iteration
             if f.owner != owner:
                 owner = f.owner
-                phi = clique_frames.present_turn(head, owner)
+                phi = (cliques[owner].turn if cliques[owner].built == iteration
+                       else clique_frames.present_turn(head, owner))
                 versine, sine = factors.turned_by(phi)
                 frame = (phi, 1.0 + versine, sine)
             transaction_log.log_factor(head, e)
