@@ -37,7 +37,9 @@ ENOUGH = 1e-10
 # Number of budgets that a step may leave to the next one, which eliminates most of these cliques
 # anyway.
 LEFT_OVER = 10.0
-RELATIVE = 3e-6
+# chi2 above which the budget of a step grows with it [sigma^2], up to so many times. More would be
+# seen along soft modes: a coordinate may be off by the root of what is left, in posterior sigmas.
+LARGE, MOST_LARGER = 200.0, 5.0
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
 SHARE = 1e-13
@@ -264,8 +266,8 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
-    most = max(scalars.budget, RELATIVE * min(scalars.chi2, float(head[tb.N_FACTORS])))
-    return min(most, scalars.share * scalars.n_moved)
+    larger = min(max(scalars.chi2 / LARGE, 1.0), MOST_LARGER)
+    return min(larger * scalars.budget, scalars.share * scalars.n_moved)
 
 
 @kernel
