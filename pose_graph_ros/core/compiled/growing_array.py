@@ -7,6 +7,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.compiled import pages
+
 
 class GrowingArray:
     """Array of rows that doubles its capacity when it is full."""
@@ -47,8 +49,8 @@ class GrowingArray:
         rows = np.asarray(rows, dtype=self._data.dtype)
         end = self._size + len(rows)
         if end > len(self._data):
-            grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]),
-                             dtype=self._data.dtype)
+            grown = pages.zeros((max(end, 2 * len(self._data)), *self._data.shape[1:]),
+                                self._data.dtype)
             grown[:self._size] = self.values
             self._data = grown
         self._data[self._size:end] = rows

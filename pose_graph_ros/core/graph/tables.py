@@ -19,7 +19,6 @@ as a row means none. Units: sigma^2 is the unit of energies.
 
 from collections.abc import Callable
 import contextlib
-import mmap
 from typing import Any, Final
 
 from numba import from_dtype, types
@@ -27,6 +26,7 @@ from numba.extending import intrinsic
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.compiled import pages
 from pose_graph_ros.core.compiled.jit import INTEGERS
 from pose_graph_ros.core.compiled.numba_internals import populate_array
 from pose_graph_ros.core.exceptions import INTERRUPTED, LinearSolveError
@@ -246,22 +246,6 @@ node_words, factor_words, clique_words, scalar_words = (
 log_numbers = _array('log', types.float64)
 
 
-def _pages(rows: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """
-    Return an array of zeros; a large one has pages of its own, which take memory when written to.
-
-    NumPy would allocate huge pages and keep them after a table has grown out of them. The pages
-    are private: a process that is forked from this one gets copies of those that it writes to.
-    """
-    size = rows * dtype.itemsize
-    if size < 2**18:
-        return np.zeros(rows, dtype)
-    pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    with contextlib.suppress(OSError):  # a kernel without huge pages
-        pages.madvise(mmap.MADV_NOHUGEPAGE)
-    return np.frombuffer(pages, dtype)
-
-
 def as_bytes(table: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return a view of rows without fields, which NumPy copies six times as fast."""
     return table.view(np.dtype((np.void, table.itemsize)))
@@ -313,7 +297,7 @@ class Memory:
     def clear_log(self) -> None:
         """Give back the pages of the log, which is empty now, if an update has filled many."""
         if self.head[LOGGED] > MOST_LOGGED:
-            self._tables['log'].base.obj.madvise(mmap.MADV_DONTNEED)  # type: ignore[union-attr]
+            pages.give_back(self._tables['log'])
             self.head[LOGGED] = 0
 
     def empty(self, name: str) -> None:
@@ -335,7 +319,7 @@ class Memory:
         for wanted in (4 * have, have + have // 4, rows):
             capacity = min(max(rows, wanted), most)
             with contextlib.suppress(OSError, MemoryError, OverflowError):
-                grown = _pages(capacity, TABLES[name])
+                grown = pages.zeros((capacity,), TABLES[name])
                 break
         else:
             raise LinearSolveError(f'{name}: no memory for {rows} rows')

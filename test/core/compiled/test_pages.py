@@ -1,0 +1,40 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Memory of arrays that grow."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.compiled import pages
+
+
+def resident() -> float:
+    """Return the memory of this process [MB]."""
+    return int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1]) * 4096e-6
+
+
+@pytest.mark.parametrize('rows', [3, 100_000])
+def test_arrays_are_zeros_of_their_own_at_first_and_when_given_back(rows: int) -> None:
+    dtype = np.dtype([('x', 'f8', (3,)), ('n', 'i4')])
+    one, other = pages.zeros((rows, 2), dtype), pages.zeros((rows, 2), dtype)
+    assert one.shape == (rows, 2)
+    assert one.dtype == dtype
+    assert not np.any(one['x'])
+    one['n'] = 7
+    assert not np.any(other['n'])
+    pages.give_back(one)
+    assert not np.any(one['n'])
+    one['n'] = 8
+    assert np.all(one['n'] == 8)
+
+
+def test_only_what_is_written_to_takes_memory() -> None:
+    before = resident()
+    array = pages.zeros((100_000_000,), np.float64)
+    array[:5_000_000] = 1.0
+    written = resident() - before
+    assert 35.0 < written < 60.0
+    pages.give_back(array)
+    assert resident() - before < written - 35.0
