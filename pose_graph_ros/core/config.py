@@ -315,8 +315,8 @@ class SmootherConfig(Settings):
 
     alpha: float = 0.035  # back-substitution stops at nodes that move by less than this [sigma]
     # Squared linearization error that a step may leave for good. What is above it, up to ten times
-    # as much, is left to the next step; above that the step iterates again. Where chi2 is from
-    # 200 to 1000, the budget grows with it: it is 1e-5 of chi2 by default [sigma^2].
+    # as much, is left to the next step; above that the step iterates again. Where chi2 and the
+    # number of loops are from 200 to 1000, it grows with the lower one, to five times [sigma^2].
     budget: float = 0.002
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
     budget_share: float = 2e-5

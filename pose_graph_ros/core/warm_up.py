@@ -101,8 +101,8 @@ def _give_back_compiler() -> None:
     """
     Give back the pages of LLVM's code, 66 MB, which nothing needs once all kernels are there.
 
-    They are read from the file again if something is compiled after all. What is free of the
-    heap, 8 MB, goes as well.
+    They are read from the file again if something is compiled after all. Free parts of the
+    heap, 8 MB, go as well.
     """
     with contextlib.suppress(OSError, AttributeError):  # on another system than Linux
         libc = ctypes.CDLL(None)

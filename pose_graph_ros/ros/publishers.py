@@ -49,7 +49,7 @@ TF_QOS = QoSProfile(depth=100)
 # Reading all of /tf costs as much as odometry: how long it is read, and the period of that [s].
 LISTENING, PAUSE = 2.0, 30.0
 
-# To ask who listens takes as long as to write a message: how often it is done [s].
+# Period of asking who listens, which takes as long as to write a message [s].
 ASKING = 0.02
 
 LATCHED = ('path', 'graph', 'verdicts')

@@ -37,8 +37,8 @@ ENOUGH = 1e-10
 # Number of budgets that a step may leave to the next one, which eliminates most of these cliques
 # anyway.
 LEFT_OVER = 10.0
-# chi2 above which the budget of a step grows with it [sigma^2], up to so many times. More would be
-# seen along soft modes: a coordinate may be off by the root of what is left, in posterior sigmas.
+# chi2 of loops above which the budget of a step grows with it [sigma^2], at most so many times.
+# More would be seen along soft modes: there a pose is off by the root of what is left, in sigmas.
 LARGE, MOST_LARGER = 200.0, 5.0
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
@@ -266,7 +266,9 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
     scalars = tb.scalars(head)[0]
-    larger = min(max(scalars.chi2 / LARGE, 1.0), MOST_LARGER)
+    # what positions add to chi2, and a contradiction by more than usual, does not count
+    loops = float(head[tb.N_EDGES] - head[tb.N_NODES])
+    larger = min(max(min(scalars.chi2, loops) / LARGE, 1.0), MOST_LARGER)
     return min(larger * scalars.budget, scalars.share * scalars.n_moved)
 
 
