@@ -316,7 +316,7 @@ class SmootherConfig(Settings):
     alpha: float = 0.035  # back-substitution stops at nodes that move by less than this [sigma]
     # Squared linearization error that a step may leave for good. What is above it, up to ten times
     # as much, is left to the next step; above that the step iterates again. Where chi2 and the
-    # number of loops are from 200 to 1000, it grows with the lower one, to five times [sigma^2].
+    # number of loops are above 200, the budget grows with the lower one, up to 1000 [sigma^2].
     budget: float = 0.002
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
     budget_share: float = 2e-5

@@ -3,6 +3,7 @@
 """Memory for arrays that grow: what is not written to takes none, what is freed goes at once."""
 
 import contextlib
+import math
 import mmap
 from typing import Any
 
@@ -17,9 +18,7 @@ def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     NumPy would allocate huge pages and keep them after a table has grown out of them. The pages
     are private: a process that is forked from this one gets copies of those that it writes to.
     """
-    size = np.dtype(dtype).itemsize
-    for n in shape:
-        size *= n
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     if size < 2**18:
         return np.zeros(shape, dtype)
     pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -29,11 +28,8 @@ def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
 
 
 def give_back(array: npt.NDArray[Any]) -> None:
-    """Make a large array of `zeros` all zeros, which takes no memory."""
-    owner: Any = array
-    while isinstance(owner, np.ndarray):
-        owner = owner.base
-    if owner is None:
-        array[...] = np.zeros((), array.dtype)
-    else:
-        owner.obj.madvise(mmap.MADV_DONTNEED)
+    """Make all of an array of `zeros` with pages of its own zero again, which takes no memory."""
+    pages: Any = array
+    while isinstance(pages, np.ndarray):
+        pages = pages.base
+    pages.obj.madvise(mmap.MADV_DONTNEED)
