@@ -211,9 +211,14 @@ class Client:
 
     def wait_values(self, wanted: Mapping[str, str]) -> None:
         """Wait for diagnostics with some values, which may come later than what they tell of."""
-        self.spin_until(
-            lambda: len(self.diagnostics) > 0 and wanted.items() <= self.values.items(),
-            f'the diagnostics have {wanted}')
+        try:
+            self.spin_until(
+                lambda: len(self.diagnostics) > 0 and wanted.items() <= self.values.items(),
+                f'the diagnostics have {wanted}')
+        except AssertionError as error:
+            age = 1e-9 * (time.time_ns() - self._sent_ns)
+            error.add_note(f'the newest, {age:.1f} s ago: {self.values if age < 1e9 else "none"}')
+            raise
 
     def wait_processed(self, count: int) -> None:
         self.spin_until(lambda: int(self.values['processed']) >= count,

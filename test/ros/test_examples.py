@@ -90,19 +90,17 @@ def test_scans_of_a_second_round_correct_the_path(node: NodeProcess, client: Cli
     ) as example:
         try:
             client.spin_until(lambda: scans.get_subscription_count() > 0, 'scans are heard')
-            for step in range(950):
-                go(step / 10.0)
-                if step % 10 == 0:
-                    scans.publish(scan_at(step / 10.0, random))
-                client.spin_for(0.002)
-            # scans are compared when a path comes, and paths come while there is odometry
-            for step in range(950, 1550):
+            # a busy machine loses some of the scans that come faster than they are compared, so
+            # that the end, until enough of them match, is in real time
+            for step in range(1550):
                 if len(closures) >= 25 and stamp_ns(closures[-1]) * 1e-9 > START + 91.5:
                     break
                 go(step / 10.0)
-                client.spin_for(0.1)
+                if step % 10 == 0:
+                    scans.publish(scan_at(step / 10.0, random))
+                client.spin_for(0.002 if step < 950 else 0.1)
             else:
-                pytest.fail('the last scans are not compared')
+                pytest.fail(f'only {len(closures)} scans match earlier ones')
             client.spin_until(lambda: int(client.values.get('loop_closure.believed', '0')) >= len(
                 closures), 'closures are believed')
         finally:
