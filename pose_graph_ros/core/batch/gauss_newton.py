@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from pose_graph_ros.core.batch.headings import solve_headings
 from pose_graph_ros.core.batch.levenberg_marquardt import Last, secant_step
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination import assembly
@@ -39,13 +40,12 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    `terms` says what constraints add; see `assembly`. But for HEADINGS the poses become the
-    references, and all factors are linearized there. Return False if a node is not determined,
-    which is `BAD_NODE` of the head, or if it is interrupted.
+    `terms` says what constraints add; see `assembly`. The poses become the references, and all
+    factors are linearized there. Return False if a node is not determined, which is `BAD_NODE` of
+    the head, or if it is interrupted.
     """
     scalars = tb.scalars(head)[0]
-    if terms != assembly.HEADINGS:
-        factors.linearize_all(head)
+    factors.linearize_all(head)
     if terms == assembly.AS_MEASURED:
         factors.as_measured(head)
     scalars.damping = damping
@@ -96,8 +96,8 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         for k in range(n_frontal):
             v = members[k]
             f = tb.nodes(head)[v]
-            for m in range(3):      # what is fixed is known, and zero but in a linear start
-                right[v, m] = x[3 * k + m] if f.fixed == 0 else f.delta[m]
+            for m in range(3):
+                right[v, m] = x[3 * k + m] if f.fixed == 0 else 0.0
     return right
 
 
@@ -192,12 +192,11 @@ def heading_steps(memory: tb.Memory, derivative: FloatArray) -> FloatArray:
 
 def solve_chordal(memory: tb.Memory, poses: Poses, place: bool) -> Poses:
     """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
-    put_poses(memory.head, poses)
-    found, rows = np.zeros_like(poses), memory['nodes'][:len(poses)]
     if not place:
-        fixed, th = rows['fixed'] != 0, poses[:, 2]
-        rows['delta'][fixed, :2] = np.stack((np.cos(th), np.sin(th)), axis=1)[fixed]
-    if not eliminate(memory.head, 0.0, assembly.AS_MEASURED if place else assembly.HEADINGS):
+        if not solve_headings(memory.head, poses):
+            raise LinearSolveError('chordal start: singular')
+        return poses
+    put_poses(memory.head, poses)
+    if not eliminate(memory.head, 0.0, assembly.AS_MEASURED):
         raise LinearSolveError('chordal start: singular')
-    step(memory.head, found, False)
-    return found + poses if place else found
+    return poses + step(memory.head, np.zeros_like(poses), False)

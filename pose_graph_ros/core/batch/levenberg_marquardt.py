@@ -172,7 +172,9 @@ def secant_step(solve: Callable[[FloatArray], FloatArray], right: FloatArray,
     What -b has lost by that step tells of H what the factorisation does not hold: the curvature of
     residuals that remain, and what is different where the poses are now.
     """
-    step, before = last or (np.zeros_like(right), right)
+    if last is None:
+        return solve(right.copy())
+    step, before = last
     change = before - right
     curvature = float(np.vdot(step, change))
     scale = 1.0 / curvature if curvature > 0.0 else 0.0

@@ -215,11 +215,15 @@ def chordal(graph: Constrained, solve: ChordalSolve | None = None, least: float 
     if graph.n_priors > 0:
         raise LinearSolveError('chordal start: a prior has no term for a heading alone')
     solve = solve or sparse_chordal(graph)
-    u = complex_of(solve(graph.poses.copy(), False))
+    poses = solve(graph.poses.copy(), False)
     # what remains of u where measured headings cancel often leads to another minimum
-    if np.any(np.abs(u) < least):
+    if np.any(np.hypot(poses[:, 0], poses[:, 1]) < least):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
-    return se2.wrapped(solve(_poses(graph, np.zeros_like(u), u), True))
+    poses[:, 2] = np.arctan2(poses[:, 1], poses[:, 0])
+    poses[:, :2] = 0.0
+    fixed = graph.fixed
+    poses[fixed] = graph.poses[fixed]
+    return se2.wrapped(solve(poses, True))
 
 
 def joint(graph: 'Graph', *, unit: bool = False) -> Poses:

@@ -79,18 +79,17 @@ def in_parts(graph: Graph, config: SolverConfig,
     if np.all(graph.fixed):
         return BatchResult(Status.CONVERGED, '', 0, chi2)
     cliques = symbolic.analyse(graph.memory.head)
-    # the root of the tree of cliques, a part of the graph, that each node is in
-    n = len(cliques.n_frontal)
-    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
-    while np.any(root[root] != root):
-        root = root[root]
+    # the part of the graph that each node is in: a tree of cliques, which follow one another
+    roots = np.flatnonzero(cliques.parent[:len(cliques.n_frontal)] < 0)
     part = np.empty(graph.n_nodes, dtype=np.int64)
-    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
+    part[cliques.nodes] = np.repeat(
+        np.arange(len(roots)), np.diff(cliques.first[roots + 1], prepend=0))
     # parts with a fixed or an observed node or an anchored prior
-    held = np.zeros(n, dtype=bool)
+    held = np.zeros(len(roots), dtype=bool)
     held[part[graph.fixed]] = True
-    ends = graph.factor_records['ends']
-    held[part[ends[(ends[:, 1] < 0) & (graph.factor_records['weight'] > 0.0), 0]]] = True
+    if not np.all(held):    # what is observed takes longer to find
+        ends = graph.factor_records['ends']
+        held[part[ends[(ends[:, 1] < 0) & (graph.factor_records['weight'] > 0.0), 0]]] = True
     for prior in graph.priors if graph.n_priors > 0 else ():
         held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
     loose = graph.node_ids[~held[part]]

@@ -17,8 +17,8 @@ LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
 # What factors add to the equations: their linearization, the same after they were logged and
 # linearized at the present estimate, as the frame in which they were may have turned since, or,
-# of a linear start, the linearization `factors.as_measured` or the equations of headings.
-LINEARIZED, RELINEARIZED, AS_MEASURED, HEADINGS = range(4)
+# of a linear start, the linearization `factors.as_measured`.
+LINEARIZED, RELINEARIZED, AS_MEASURED = range(3)
 
 
 @kernel
@@ -52,8 +52,6 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
             scale_t, scale_r = node.scale_t * node.scale_t, node.scale_r * node.scale_r
             least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
             least[3 * k + 2] = LEAST_PIVOT * scale_r
-            if terms == HEADINGS:
-                least[3 * k:3 * k + 3] = 0.0
             if by_weakest:
                 _lower_bounds(head, v, least[3 * k:3 * k + 3])
             for m in range(3 if damping > 0.0 else 0):
@@ -114,9 +112,6 @@ def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped
         # one between frontal nodes is in all their lists: added from the first of its ends
         if (at_i < 0 or (f.ends[1] >= 0 and at_j < 0) or (f.ends[2] >= 0 and at_k < 0)
                 or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
-            continue
-        if terms == HEADINGS:
-            normal_equations.add_headings(head, e, at_i, at_j, front, ld)
             continue
         if terms == RELINEARIZED:
             transaction_log.log_factor(head, e)

@@ -31,8 +31,8 @@ NEWEST_LAST = 10
 _MANY = 2**32
 # Limits of amalgamation: explicit zero blocks and frontal nodes of a merged clique. They differ
 # from those of the incremental smoother, as every clique is eliminated in every iteration here.
-RELAXED_ZEROS = 8
-RELAXED_FRONTAL = 24
+RELAXED_ZEROS = 24
+RELAXED_FRONTAL = 32
 
 
 class Cliques(NamedTuple):

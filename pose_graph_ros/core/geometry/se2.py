@@ -41,10 +41,13 @@ def wrap(angle: npt.ArrayLike) -> FloatArray:
     angle = np.asarray(angle, dtype=np.float64)
     if angle.ndim == 0:     # as most are; the rest takes ten times as long
         return np.asarray(wrap_one(float(angle)))
-    wrapped = np.mod(angle + np.pi, TWO_PI) - np.pi
-    # mod may round up to 2 pi for a tiny negative argument
-    wrapped = np.where(wrapped >= np.pi, -np.pi, wrapped)
-    return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
+    outside = ~((angle >= -np.pi) & (angle < np.pi))
+    wrapped = np.array(angle)
+    if np.any(outside):
+        turned = np.mod(angle[outside] + np.pi, TWO_PI) - np.pi
+        # mod may round up to 2 pi for a tiny negative argument
+        wrapped[outside] = np.where(turned >= np.pi, -np.pi, turned)
+    return wrapped
 
 
 def wrapped(pose: FloatArray) -> FloatArray:

@@ -7,8 +7,6 @@ Symbols are those of `factors`. With G the two columns of a third node, a factor
 `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 """
 
-import math
-
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors as fc, tables as tb
 
@@ -131,33 +129,6 @@ def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore
         for n in range(3):
             for row, value in ((a + n, of_i[n]), (b + n, of_j[n])):
                 front[min(row, k + m) * ld + max(row, k + m)] += value
-
-
-@kernel
-def add_headings(head, e, a, b, front, ld):  # type: ignore[no-untyped-def]
-    """
-    Add the equation of headings in a linear start to a front, as `add` does.
-
-    It is `u_j = r u_i`, or `u_i = r` where a node is observed, of complex numbers: see
-    `batch.linear_starts`. The third unknown of each node is 0.
-    """
-    f = tb.factors(head)[e]
-    kappa, th = f.weight * f.information[5], f.mean[2] - (f.constants[2] if b < 0 else 0.0)
-    c, s = kappa * math.cos(th), kappa * math.sin(th)
-    for at in (a, b):
-        for m in range(3 if at >= 0 else 0):
-            front[(at + m) * (ld + 1)] += kappa
-    if b < 0:
-        front[(a + 1) * ld - 1] += c
-        front[(a + 2) * ld - 1] += s
-        return
-    if a > b:
-        a, b, s = b, a, -s
-    r = a * ld + b      # block ij is that of -kappa conj(r)
-    front[r] -= c
-    front[r + 1] -= s
-    front[r + ld] += s
-    front[r + ld + 1] -= c
 
 
 @kernel
