@@ -66,7 +66,7 @@ def _clique(head, c, right):  # type: ignore[no-untyped-def]
     row = tb.cliques(head)[c]
     n = row.n_frontal + row.n_separator
     members = tb.pool_i(head)[row.members:row.members + n]
-    x = tb.work_f(head)[:3 * n]
+    x = tb.work_f(head)[:3 * n + 3]
     for k in range(n):
         v = members[k]
         for m in range(3):
@@ -85,14 +85,14 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
     for c in range(n_priors, n_cliques if chord else n_priors):
         members, n_frontal, values, x = _clique(head, c, right)
-        forward_rows(values, 3 * n_frontal, len(x), x)
+        forward_rows(values, 3 * n_frontal, 3 * len(members), x)
         for k in range(len(members)):
             v = members[k]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
     for c in range(n_cliques - 1, n_priors - 1, -1):
         members, n_frontal, values, x = _clique(head, c, right)
-        backward_rows(values, 3 * n_frontal, len(x), x, not chord)
+        backward_rows(values, 3 * n_frontal, 3 * len(members), x, not chord)
         for k in range(n_frontal):
             v = members[k]
             f = tb.nodes(head)[v]

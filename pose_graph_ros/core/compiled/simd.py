@@ -126,18 +126,6 @@ plus = _of_vectors(2, lambda builder, a, b: builder.fadd(a, b))
 
 
 @kernel(inline='always')
-def copy(source, begin, target, to, n):  # type: ignore[no-untyped-def]
-    """Copy `source[begin:begin + n]` to `target[to:to + n]`."""
-    k = 0
-    while k + WIDTH <= n:
-        store(target, to + k, load(source, begin + k))
-        k += WIDTH
-    while k < n:
-        target[to + k] = source[begin + k]
-        k += 1
-
-
-@kernel(inline='always')
 def add(source, begin, target, to, n):  # type: ignore[no-untyped-def]
     """Add `source[begin:begin + n]` to `target[to:to + n]`."""
     k = 0

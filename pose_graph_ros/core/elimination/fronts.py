@@ -18,7 +18,6 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import (
-    copy,
     fnmadd,
     load,
     spread,
@@ -122,10 +121,14 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
 @kernel
 def write_rows(front, n, ld, pool_f, at):  # type: ignore[no-untyped-def]
     """Write the upper triangle of the n rows of a front with right-hand sides, without gaps."""
-    for k in range(n):
-        copy(front, k * (ld + 1), pool_f, at, n - k)
+    for k in range(n - 1):
+        m = 0
+        while m < n - k:    # what a vector writes beyond the row is overwritten by the next ones
+            store(pool_f, at + m, load(front, k * (ld + 1) + m))
+            m += WIDTH
         at += n - k + 1
         pool_f[at - 1] = front[(k + 1) * ld - 1]
+    pool_f[at], pool_f[at + 1] = front[(n - 1) * (ld + 1)], front[n * ld - 1]
 
 
 @kernel
@@ -133,7 +136,8 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
     Solve `R^T y = x` for the frontal rows of a clique, and subtract them from the separator's.
 
-    The values are the first rows of a triangle of n columns, laid out by `pools.row_start`.
+    The values are the first rows of a triangle of n columns, laid out by `pools.row_start`. Behind
+    what x holds there is room for three numbers.
     """
     for k in range(0, rows, 3):
         # where column 0 of each row would be
@@ -142,14 +146,10 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
         b = (x[k + 1] - values[p + k + 1] * a) * values[q + k + 1]
         c = (x[k + 2] - values[p + k + 2] * a - values[q + k + 2] * b) * values[r + k + 2]
         x[k], x[k + 1], x[k + 2] = a, b, c
-        va, vb, vc, m = spread(a), spread(b), spread(c), k + 3
-        while m + WIDTH <= n:
+        va, vb, vc = spread(a), spread(b), spread(c)
+        for m in range(k + 3, n, WIDTH):
             y = fnmadd(fnmadd(load(x, m), va, load(values, p + m)), vb, load(values, q + m))
             store(x, m, fnmadd(y, vc, load(values, r + m)))
-            m += WIDTH
-        while m < n:
-            x[m] -= a * values[p + m] + b * values[q + m] + c * values[r + m]
-            m += 1
 
 
 @kernel(fastmath=_FAST)
@@ -160,26 +160,20 @@ def backward_rows(values, rows, n, x, stored):  # type: ignore[no-untyped-def]
     Values are as for `forward_rows`; x has the solution of the separator, and before it y, unless
     y is the right-hand side that is stored with R.
     """
+    x[n] = x[n + 1] = x[n + 2] = 0.0    # what the last vector reads beyond the row counts nothing
     for k in range(rows - 3, -1, -3):
         p, q, r = row_start(k, n), row_start(k + 1, n), row_start(k + 2, n)
         u = v = w = spread(0.0)
-        m = k + 3
-        while m + WIDTH <= n:
+        for m in range(k + 3, n, WIDTH):
             y = load(x, m)
             u = fnmadd(u, load(values, p + m), y)
             v = fnmadd(v, load(values, q + m), y)
             w = fnmadd(w, load(values, r + m), y)
-            m += WIDTH
         a, b, c = total(u), total(v), total(w)
         if stored:
             a, b, c = a + values[p + n], b + values[q + n], c + values[r + n]
         else:
             a, b, c = a + x[k], b + x[k + 1], c + x[k + 2]
-        while m < n:
-            a -= values[p + m] * x[m]
-            b -= values[q + m] * x[m]
-            c -= values[r + m] * x[m]
-            m += 1
         c *= values[r + k + 2]
         b = (b - values[q + k + 2] * c) * values[q + k + 1]
         x[k] = (a - values[p + k + 1] * b - values[p + k + 2] * c) * values[p + k]

@@ -90,7 +90,7 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
             dx = (r[6] - (r[3] * x2 + r[4] * y2 + r[5] * th2) - r[2] * th - r[1] * y) * r[0]
             _move(head, members[0], dx, y, th, 0.0, alpha)
         return
-    x = work_f[:n]
+    x = work_f[:n + 3]
     cos, sin, px, py = 1.0, 0.0, 0.0, 0.0
     if phi != 0.0:
         versine, sin = factors.turned_by(phi)

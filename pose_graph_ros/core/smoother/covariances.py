@@ -104,7 +104,7 @@ def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-de
             nodes[v].index = n
             n += 3
     # right-hand sides in map axes, of which the solutions of frontal nodes take the place
-    right, x, places = np.zeros((m, n)), np.empty(3 * largest), np.empty(largest, np.int32)
+    right, x, places = np.zeros((m, n)), np.zeros(3 * largest + 3), np.empty(largest, np.int32)
     right[:, nodes[i].index:nodes[i].index + 3] = of_i
     if j >= 0:
         right[:, nodes[j].index:nodes[j].index + 3] += of_j

@@ -36,3 +36,26 @@ def test_a_bad_pivot_is_found_in_its_row(bad: int) -> None:
     assert fronts.factorize(front.ravel(), 12, 12, ld, np.full(12, 0.01)) == bad
     front[bad, bad] = np.nan
     assert fronts.factorize(front.ravel(), 12, 12, ld, np.full(12, 0.01)) == bad
+
+
+@pytest.mark.parametrize(('rows', 'n'), [(3, 3), (3, 6), (6, 6), (6, 15), (9, 12), (12, 21)])
+def test_rows_are_written_and_solved_as_a_dense_triangle_is(rows: int, n: int) -> None:
+    rng, ld = np.random.default_rng(rows * n), fronts.padded(n)
+    front = rng.standard_normal((n, ld))
+    pool = np.full(n * (n + 3) // 2 + 6, -7.0)
+    fronts.write_rows(front.ravel(), n, ld, pool, 3)
+    triangle = [number for k in range(n) for number in (*front[k, k:n], front[k, -1])]
+    np.testing.assert_array_equal(pool[3:-3], triangle)
+    np.testing.assert_array_equal(pool[[0, 1, 2, -3, -2, -1]], -7.0)
+
+    R = np.triu(front[:rows, :n])
+    R[np.diag_indices(rows)] = 1.0 / R.diagonal()   # the reciprocal is stored
+    right, values = rng.standard_normal(n), np.append(pool[3:-3], np.zeros(3))
+    x = np.append(right, np.full(3, np.nan))
+    fronts.forward_rows(values, rows, n, x)
+    y = np.linalg.solve(R[:, :rows].T, right[:rows])
+    np.testing.assert_allclose(x[:n], np.append(y, right[rows:] - R[:, rows:].T @ y), rtol=1e-9)
+    for stored, left in ((False, x[:rows].copy()), (True, front[:rows, -1])):
+        fronts.backward_rows(values, rows, n, x, stored)
+        np.testing.assert_allclose(
+            R[:, :rows] @ x[:rows], left - R[:, rows:] @ x[rows:n], rtol=1e-9, atol=1e-9)
