@@ -94,8 +94,7 @@ def dissected(world: World, graph: Graph, by_degree: symbolic.Cliques) -> symbol
         head, np.empty(0, np.int32), prior_rows.all_priors(head), order)
     # all nodes are those that are eliminated last, in their order
     return symbolic.Cliques(*symbolic.in_postorder(
-        order, ordering.minimum_degree(len(order), 0, 0, len(order), start, adjacency), 0,
-        symbolic.RELAXED_ZEROS, symbolic.RELAXED_FRONTAL))
+        order, ordering.minimum_degree(len(order), 0, 0, len(order), start, adjacency), 0))
 
 
 def _halved(nodes: IntArray, edges: IntArray, poses: FloatArray, side: Any) -> Iterator[IntArray]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch.headings import solve_headings
 from pose_graph_ros.core.batch.levenberg_marquardt import Last, secant_step
-from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
+from pose_graph_ros.core.compiled.jit import FLAG, kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination import assembly
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -35,29 +35,24 @@ def put_poses(head, poses):  # type: ignore[no-untyped-def]
         factors.refer_to_pose(tb.nodes(head)[v])
 
 
-@kernel(signature=(tb.HEAD, NUMBER, INTEGER))
-def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, NUMBER, FLAG))
+def eliminate(head, damping, as_measured):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    `terms` says what constraints add; see `assembly`. The poses become the references, and all
-    factors are linearized there. Return False if a node is not determined, which is `BAD_NODE` of
-    the head, or if it is interrupted.
+    All factors are linearized at the poses, of a linear start by `factors.as_measured`. Return
+    False if a node is not determined, which is `BAD_NODE` of the head, or if it is interrupted.
     """
     scalars = tb.scalars(head)[0]
     factors.linearize_all(head)
-    if terms == assembly.AS_MEASURED:
+    if as_measured:
         factors.as_measured(head)
-    scalars.damping = damping
-    bad = -1
+    scalars.damping, head[tb.BAD_NODE] = damping, -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
-        bad = assembly.eliminate_clique(head, c, terms)
-        if bad >= 0:
-            head[tb.BAD_NODE] = bad
-        if bad >= 0 or tb.interrupt(head)[tb.ALL] != 0:
-            break
+        if head[tb.BAD_NODE] < 0 and tb.interrupt(head)[tb.ALL] == 0:
+            head[tb.BAD_NODE] = assembly.eliminate_clique(head, c, False)
     scalars.damping = 0.0
-    return bad < 0 and tb.interrupt(head)[tb.ALL] == 0
+    return head[tb.BAD_NODE] < 0 and tb.interrupt(head)[tb.ALL] == 0
 
 
 @kernel(forceinline=True)
@@ -173,7 +168,7 @@ class CompiledSystem:
         return chi2, rounding
 
     def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
-        if not chord and not eliminate(self._head, damping, assembly.LINEARIZED):
+        if not chord and not eliminate(self._head, damping, False):
             return math.inf, 0.0
         found = secant_step(lambda right: step(self._head, right, chord), self._right,
                             self._last if chord else None)
@@ -192,11 +187,8 @@ def heading_steps(memory: tb.Memory, derivative: FloatArray) -> FloatArray:
 
 def solve_chordal(memory: tb.Memory, poses: Poses, place: bool) -> Poses:
     """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
-    if not place:
-        if not solve_headings(memory.head, poses):
-            raise LinearSolveError('chordal start: singular')
-        return poses
-    put_poses(memory.head, poses)
-    if not eliminate(memory.head, 0.0, assembly.AS_MEASURED):
+    if place:
+        put_poses(memory.head, poses)
+    if not (eliminate(memory.head, 0.0, True) if place else solve_headings(memory.head, poses)):
         raise LinearSolveError('chordal start: singular')
-    return poses + step(memory.head, np.zeros_like(poses), False)
+    return poses + step(memory.head, np.zeros_like(poses), False) if place else poses

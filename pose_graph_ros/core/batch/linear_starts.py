@@ -221,8 +221,7 @@ def chordal(graph: Constrained, solve: ChordalSolve | None = None, least: float 
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
     poses[:, 2] = np.arctan2(poses[:, 1], poses[:, 0])
     poses[:, :2] = 0.0
-    fixed = graph.fixed
-    poses[fixed] = graph.poses[fixed]
+    poses[graph.fixed] = graph.poses[graph.fixed]
     return se2.wrapped(solve(poses, True))
 
 

@@ -15,19 +15,14 @@ from pose_graph_ros.core.graph.pools import row_start, separator, triangle_size,
 # add in their weakest direction, and, because of rounding, of all that they add.
 LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
-# What factors add to the equations: their linearization, the same after they were logged and
-# linearized at the present estimate, as the frame in which they were may have turned since, or,
-# of a linear start, the linearization `factors.as_measured`.
-LINEARIZED, RELINEARIZED, AS_MEASURED = range(3)
-
-
 @kernel
-def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
+def eliminate_clique(head, c, relinearized):  # type: ignore[no-untyped-def]
     """
     Return a node with a bad pivot, or -1, after the elimination of a clique.
 
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
-    a pivot is small, it is judged again by the weakest direction of the factors of its node.
+    a pivot is small, it is judged again by the weakest direction of the factors of its node. In
+    an update its factors are logged and linearized again: its frame may have turned since.
     """
     nodes, pool_f, work_f = tb.nodes(head), tb.pool_f(head), tb.work_f(head)
     damping, pool_i, cliques = tb.scalars(head)[0].damping, tb.pool_i(head), tb.cliques(head)
@@ -48,7 +43,7 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
         anchored = 0
         for k in range(n_frontal):
             v, node = members[k], nodes[members[k]]
-            anchored |= _add_factors(head, v, c, terms, rows, front, ld)
+            anchored |= _add_factors(head, v, c, relinearized, rows, front, ld)
             scale_t, scale_r = node.scale_t * node.scale_t, node.scale_r * node.scale_r
             least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
             least[3 * k + 2] = LEAST_PIVOT * scale_r
@@ -96,7 +91,7 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped-def]
+def _add_factors(head, v, c, relinearized, rows, front, ld):  # type: ignore[no-untyped-def]
     """
     Add the factors of a frontal node of a clique to its front, which has so many frontal rows.
 
@@ -113,7 +108,7 @@ def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped
         if (at_i < 0 or (f.ends[1] >= 0 and at_j < 0) or (f.ends[2] >= 0 and at_k < 0)
                 or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
             continue
-        if terms == RELINEARIZED:
+        if relinearized:
             transaction_log.log_factor(head, e)
             linearize(head, e)
         f.owner = c

@@ -32,8 +32,6 @@ from pose_graph_ros.core.graph.pools import row_start
 # lost all its digits to cancellation: the node is not determined.
 LEAST_PIVOT = 1e-12
 
-_FAST = {'reassoc', 'contract', 'nsz', 'arcp'}
-
 
 @kernel
 def padded(n):  # type: ignore[no-untyped-def]
@@ -152,7 +150,7 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
             store(x, m, fnmadd(y, vc, load(values, r + m)))
 
 
-@kernel(fastmath=_FAST)
+@kernel
 def backward_rows(values, rows, n, x, stored):  # type: ignore[no-untyped-def]
     """
     Solve `R x = y` for the frontal nodes of a clique.

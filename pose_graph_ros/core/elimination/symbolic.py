@@ -29,10 +29,8 @@ from pose_graph_ros.core.graph.rows import forget_touched
 NEWEST_LAST = 10
 # More than there are nodes.
 _MANY = 2**32
-# Limits of amalgamation: explicit zero blocks and frontal nodes of a merged clique. They differ
-# from those of the incremental smoother, as every clique is eliminated in every iteration here.
-RELAXED_ZEROS = 24
-RELAXED_FRONTAL = 32
+# Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
+MOST_ZEROS, MOST_FRONTAL = 32, 16
 
 
 class Cliques(NamedTuple):
@@ -158,9 +156,8 @@ def analyse(head):  # type: ignore[no-untyped-def]
     n_last = newest_last(order, head[tb.NEWEST], head[tb.FIXED])
     priors = prior_rows.all_priors(head)
     _, start, adjacency = structure(head, np.empty(0, np.int32), priors, order)
-    first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(
-        order, minimum_degree(len(order), len(priors), 0, n_last, start, adjacency), 0,
-        RELAXED_ZEROS, RELAXED_FRONTAL)
+    raw = minimum_degree(len(order), len(priors), 0, n_last, start, adjacency)
+    first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(order, raw, 0)
     for c in priors:
         n_separator = np.int64(tb.cliques(head)[c].n_separator)
         need_f += pools.rounded(pools.n_values(0, n_separator))
@@ -169,15 +166,13 @@ def analyse(head):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def in_postorder(  # type: ignore[no-untyped-def]
-    order, eliminated, n_before, most_zeros, most_frontal,
-):
+def in_postorder(order, raw, n_before):  # type: ignore[no-untyped-def]
     """
     Return the cliques found by `minimum_degree`, amalgamated and in postorder.
 
     Its node k is `order[k]`; the first `n_before` are not in a clique with others.
     """
-    n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
+    n_raw, offset, raw_frontal, raw_parent, raw_nodes = raw
     n_apart = 0
     while n_apart < n_raw and raw_nodes[offset[n_apart]] < n_before:
         n_apart += 1
@@ -192,7 +187,7 @@ def in_postorder(  # type: ignore[no-untyped-def]
         separator = offset[k + 1] - offset[k] - raw_frontal[k]
         width = n_frontal_of[q] + offset[q + 1] - offset[q] - raw_frontal[q]
         added = zeros[k] + zeros[q] + n_frontal_of[k] * (width - separator)
-        if added <= most_zeros and n_frontal_of[k] + n_frontal_of[q] <= most_frontal:
+        if added <= MOST_ZEROS and n_frontal_of[k] + n_frontal_of[q] <= MOST_FRONTAL:
             into[k], zeros[q] = q, added
             n_frontal_of[q] += n_frontal_of[k]
     for k in range(n_raw - 1, -1, -1):

@@ -265,7 +265,7 @@ class Memory:
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:
             self.ensure(name, {'scalars': 1, 'interrupt': 2}.get(name) or {
-                'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
+                'pool_f': 256, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
         self.ensure('work_f', 256)  # for `chain` and `step`; fronts ask for more
         self.ensure('log', 64)  # for `transaction_log.begin` of an empty graph
         if another is not None:

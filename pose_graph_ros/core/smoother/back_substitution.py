@@ -71,40 +71,26 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
 @kernel
 def _visit(head, c):  # type: ignore[no-untyped-def]
     """Solve for the frontal nodes of a clique."""
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    pool_f, work_f = tb.pool_f(head), tb.work_f(head)
-    row = cliques[c]
-    n_frontal, n_separator = row.n_frontal, row.n_separator
-    rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
-    members = pool_i[row.members:row.members + n_frontal + n_separator]
-    phi = row.turn
-    alpha = tb.scalars(head)[0].alpha
+    nodes, row = tb.nodes(head), tb.cliques(head)[c]
+    n_frontal, n = row.n_frontal, row.n_frontal + row.n_separator
+    members, x = tb.pool_i(head)[row.members:row.members + n], tb.work_f(head)[:3 * n + 3]
+    phi, alpha = row.turn, tb.scalars(head)[0].alpha
     if row.anchored == 0:
         alpha *= FREE_FRACTION
-    if phi == 0.0 and n_frontal == 1 and n_separator == 1:
-        if nodes[members[0]].fixed == 0:    # as along a chain
-            r, f = pool_f[row.values:row.values + 18], nodes[members[1]]
-            x2, y2, th2 = f.delta[0], f.delta[1], f.delta[2]
-            th = (r[17] - (r[14] * x2 + r[15] * y2 + r[16] * th2)) * r[13]
-            y = (r[12] - (r[9] * x2 + r[10] * y2 + r[11] * th2) - r[8] * th) * r[7]
-            dx = (r[6] - (r[3] * x2 + r[4] * y2 + r[5] * th2) - r[2] * th - r[1] * y) * r[0]
-            _move(head, members[0], dx, y, th, 0.0, alpha)
-        return
-    x = work_f[:n + 3]
     cos, sin, px, py = 1.0, 0.0, 0.0, 0.0
     if phi != 0.0:
         versine, sin = factors.turned_by(phi)
         cos = 1.0 + versine
         f = nodes[members[n_frontal]]
         px, py = f.pose[0], f.pose[1]
-    for k in range(n_frontal, n_frontal + n_separator):
+    for k in range(n_frontal, n):
         f = nodes[members[k]]
         if phi == 0.0:
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = f.delta[0], f.delta[1], f.delta[2]
         else:
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = clique_frames.local_delta(
                 f, px, py, cos, sin, phi)
-    backward_rows(pool_f[row.values:], rows, n, x, True)
+    backward_rows(tb.pool_f(head)[row.values:], 3 * n_frontal, 3 * n, x, True)
     for k in range(n_frontal):
         v = members[k]
         dx, dy, dth = x[3 * k], x[3 * k + 1], x[3 * k + 2]

@@ -12,7 +12,7 @@ keep all their values, including their update matrices.
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
+from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.elimination.symbolic import (
     in_postorder,
@@ -28,9 +28,6 @@ from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 # of the head, then the kernel be called again. BAD_PIVOT: node `BAD_NODE` of the head is not
 # determined. INTERRUPTED: see `interrupted`. After the last three the caller has to roll back.
 DONE, UNFINISHED, MORE_MEMORY, BAD_PIVOT, DIVERGED, INTERRUPTED = range(6)
-# Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
-RELAXED_ZEROS = 16
-RELAXED_FRONTAL = 16
 # Value of TOUCHED for nodes that are ordered before all others, since they are about to leave.
 ORDERED_FIRST = 2
 
@@ -114,9 +111,8 @@ def reordered(head, marked, affected):  # type: ignore[no-untyped-def]
         loose[n_loose], c = c, tree[c].sibling
         n_loose += 1
     orphans, start, adjacency = structure(head, marked, loose[:n_loose], affected)
-    cliques = in_postorder(
-        affected, minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency),
-        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL)
+    raw = minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency)
+    cliques = in_postorder(affected, raw, n_leaving)
     if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
                     head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
         return MORE_MEMORY, marked
@@ -177,7 +173,7 @@ def eliminate(head, rows):  # type: ignore[no-untyped-def]
     for c in rows:
         if interrupted(head):
             return INTERRUPTED
-        head[tb.BAD_NODE] = eliminate_clique(head, c, RELINEARIZED)
+        head[tb.BAD_NODE] = eliminate_clique(head, c, True)
         if head[tb.BAD_NODE] >= 0:
             return BAD_PIVOT
         if tb.cliques(head)[c].parent < 0:

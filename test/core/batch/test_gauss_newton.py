@@ -12,7 +12,6 @@ from random_graphs import dense_system, free_part, random_graph
 from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.batch.levenberg_marquardt import secant_step
 from pose_graph_ros.core.elimination import symbolic
-from pose_graph_ros.core.elimination.assembly import LINEARIZED
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
@@ -41,7 +40,7 @@ def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
 def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     """Make a step; return the solution of the free nodes, in the order of H."""
     head = graph.memory.head
-    assert gauss_newton.eliminate(head, damping, LINEARIZED)
+    assert gauss_newton.eliminate(head, damping, False)
     found = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
     length = gauss_newton.move(head, found)
     step = graph.node_records['delta']

