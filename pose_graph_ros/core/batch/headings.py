@@ -79,7 +79,7 @@ def _eliminate(head, c, poses):  # type: ignore[no-untyped-def]
             front[2 * b * ld + b] += kappa
             if a > b:
                 a, b, y = b, a, -y
-            front[2 * a * ld + b] -= x      # block ij is that of -kappa conj(r)
+            front[2 * a * ld + b] -= x      # entry ij is -kappa conj(r)
             front[(2 * a + 1) * ld + b] += y
     child = row.child
     while child >= 0:

@@ -21,8 +21,8 @@ def eliminate_clique(head, c, relinearized):  # type: ignore[no-untyped-def]
     Return a node with a bad pivot, or -1, after the elimination of a clique.
 
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
-    a pivot is small, it is judged again by the weakest direction of the factors of its node. In
-    an update its factors are logged and linearized again: its frame may have turned since.
+    a pivot is small, it is judged again by the weakest direction of the factors of its node. With
+    `relinearized`, factors are logged and linearized again first, as their frame may have turned.
     """
     nodes, pool_f, work_f = tb.nodes(head), tb.pool_f(head), tb.work_f(head)
     damping, pool_i, cliques = tb.scalars(head)[0].damping, tb.pool_i(head), tb.cliques(head)
