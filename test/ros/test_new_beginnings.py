@@ -68,7 +68,8 @@ def test_the_graph_before_a_new_beginning_is_brought_back_and_goes_on(
     else:
         client.node.destroy_publisher(client.odom)
         client.odom = publisher(client)
-        for step in range(70):  # until they are judged by who sends them, as a robot would
+        # a robot goes on sending, and each message is judged by who publishes at that moment
+        for step in range(70):
             client.odom.publish(odometry_at(0.1 * step))
             client.spin_for(0.05)
             if client.values['resets'] == '1':

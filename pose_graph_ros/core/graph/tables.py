@@ -263,7 +263,7 @@ class Memory:
         self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[FIXED] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
-        for name in NAMES:
+        for name in NAMES:  # with 8 MB for values, graphs of some thousand nodes never copy them
             self.ensure(name, {'scalars': 1, 'interrupt': 2}.get(name) or {
                 'pool_f': 256, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
         self.ensure('work_f', 256)  # for `chain` and `step`; fronts ask for more
