@@ -28,7 +28,6 @@ import hashlib
 import logging
 import os
 from pathlib import Path
-import pickle
 import sys
 import tempfile
 from types import CodeType, FunctionType, ModuleType
@@ -42,6 +41,7 @@ from pose_graph_ros.core.compiled import numba_internals as ni
 logger = logging.getLogger(__name__)
 
 OWNER = 'pose_graph_ros'
+LAYOUT = 2  # of the files, counted up when it changes
 # Settings of Numba that change the generated code.
 SETTINGS = ('OPT', 'LOOP_VECTORIZE', 'SLP_VECTORIZE', 'BOUNDSCHECK', 'DEBUGINFO_DEFAULT')
 
@@ -92,7 +92,7 @@ def _candidates(source: Path) -> Iterator[Path]:
 def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     """Return a digest of all inputs of a kernel's machine code except its signature."""
     parts: list[object] = [
-        numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
+        LAYOUT, numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
         [(name, getattr(numba.config, name, None)) for name in SETTINGS]]
     ours = {_top(__name__), _top(dispatcher.py_func.__module__)}
     todo: list[Any] = [dispatcher]
@@ -184,15 +184,11 @@ class KernelCache:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the code for a signature; None if there is none that is valid."""
-        # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
-        # this, which is all that machine code needs. The compiler refreshes the context itself.
-        ni.rtsys.initialize(target_context)
         for path in self._files(signature):
             code = self._code(path)
             try:
                 if code is not None:
-                    return ni.CompileResult._rebuild(  # noqa: SLF001
-                        target_context, *pickle.loads(code))
+                    return ni.loaded(target_context, code)
             except Exception as error:
                 _warn('read', path.parent, error)
         return None
@@ -204,7 +200,7 @@ class KernelCache:
             return
         path = next(self._files(signature))
         try:
-            code = ni.serialize.dumps(result._reduce())  # noqa: SLF001
+            code = ni.dumped(result)
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
                 file.write(fingerprint(self._dispatcher) + hashlib.sha256(code).digest() + code)
             os.replace(file.name, path)

@@ -15,14 +15,18 @@ take a newer one, run all tests with it, and raise the bound here, in setup.py a
 - The options `_nrt` and `no_cfunc_wrapper` of `njit`: kernels that own no array count no
   references, and no wrapper for C is compiled.
 - `CompileResult` makes of compiled code what can be pickled by `serialize` (`_reduce`), unless its
-  `library` has dynamic globals, and code of that (`_rebuild`); `sigutils` gives the types in a
-  signature. `rtsys`, which kernels that allocate arrays run on, has to be initialized before
-  their code is loaded.
+  `library` has dynamic globals, and code of that (`_rebuild`), see `dumped` and `loaded`;
+  `_defined_symbols` of the engine and `_get_module_for_linking` of a library are what these
+  replace. `sigutils` gives the types in a signature. `rtsys`, which kernels that allocate arrays
+  run on, has to be initialized before their code is loaded.
 - `ir` makes vectors of numbers, `populate_array` an array over the memory of the tables.
 """
 
+import functools
+import pickle
 import re
 from typing import Any
+import zlib
 
 import numba
 
@@ -44,14 +48,50 @@ check_version(numba.__version__)
 # ruff: noqa: E402  another version may lack them
 from numba.core import serialize, sigutils
 from numba.core.cgutils import ir
+from numba.core.codegen import ll
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
 
-__all__ = ['CompileResult', 'Dispatcher', 'ir', 'rtsys', 'serialize', 'sigutils']
+__all__ = ['CompileResult', 'Dispatcher', 'ir', 'sigutils']
 
 
 def populate_array(*arguments: Any) -> None:
     """Call Numba's function, whose module only the compiler needs, and which takes 0.1 s."""
     from numba.np import arrayobj  # noqa: PLC0415
     arrayobj.populate_array(*arguments)
+
+
+def dumped(result: CompileResult) -> bytes:
+    """
+    Return compiled code as bytes, laid out for `loaded`.
+
+    Numba would parse the intermediate code with the machine code, half of the time and two thirds
+    of the memory, and import the modules of its own functions that were compiled into it. Only
+    constants are read of their environments, and the types of all variables are for people.
+    """
+    module = result.library._get_module_for_linking()  # noqa: SLF001
+    names = {each.name for each in (*module.functions, *module.global_variables)
+             if not each.is_declaration}
+    (name, kind, (code, bitcode)), *parts, _, reload_init, environments = (
+        result._reduce())  # noqa: SLF001
+    kept = tuple(each for each in environments if len(each.consts) > 0)
+    return bytes(serialize.dumps((
+        (name, kind, (code, _EMPTY)), (*parts, '', reload_init, kept), names,
+        zlib.compress(bitcode))))
+
+
+def loaded(target_context: Any, code: bytes) -> CompileResult:
+    """Return the code of `dumped`, ready to be called."""
+    # what Numba does when it refreshes the context, but that also imports all that can be compiled
+    rtsys.initialize(target_context)
+    library, parts, names, bitcode = pickle.loads(code)
+    target_context.codegen()._engine._defined_symbols |= names  # noqa: SLF001
+    result = CompileResult._rebuild(target_context, library, *parts)  # noqa: SLF001
+    # the kernel may be a part of one that is compiled later
+    result.library._get_module_for_linking = functools.cache(  # noqa: SLF001
+        lambda: ll.parse_bitcode(zlib.decompress(bitcode)))
+    return result
+
+
+_EMPTY = ll.parse_assembly('').as_bitcode()

@@ -142,6 +142,20 @@ def test_second_start_takes_all_from_the_cache(folder: Path) -> None:
     assert loaded(again.total)
 
 
+def test_code_is_loaded_without_the_compiler(folder: Path) -> None:
+    (folder / 'inner.py').write_text(INNER.replace('GAIN * x', 'GAIN * np.full(3, x).max()')
+                                     .replace('kernel(', 'kernel(allocates=True, ')
+                                     .replace('GAIN =', 'import numpy as np\nGAIN ='))
+    (folder / 'outer.py').write_text(OUTER.replace('kernel(', 'kernel(allocates=True, '))
+    script = START + "import sys\nprint('numba.np.arraymath' in sys.modules)\n"
+    environment = dict(os.environ, PYTHONPATH=os.pathsep.join((str(folder.parent), str(TREE))))
+    first, again = (subprocess.run(
+        [sys.executable, '-c', script], env=environment, capture_output=True, text=True,
+        check=True).stdout.split() for _ in range(2))
+    assert (first[:2], first[-1]) == (['6.0', 'False'], 'True')
+    assert (again[:2], again[-1]) == (['6.0', 'True'], 'False')
+
+
 @pytest.mark.parametrize('outer', [OUTER, OUTER_BY_MODULE], ids=['name', 'module'])
 @pytest.mark.parametrize('change', [
     ('GAIN = 2.0', 'GAIN = 5.0'), ('GAIN * x', '(3.0 + GAIN) * x')], ids=['number', 'code'])
