@@ -33,12 +33,14 @@ def main(args: list[str] | None = None) -> int:
 
     from pose_graph_ros.core.exceptions import ConfigError, NumbaVersionError
     try:
+        from pose_graph_ros.core.compiled import pages
         from pose_graph_ros.ros.node import PoseGraphNode
         from pose_graph_ros.ros.spinning import Spinner
     except NumbaVersionError as error:
         print(f'pose_graph_node: {error}', file=sys.stderr)
         return 2
 
+    pages.return_when_freed()
     logging.captureWarnings(capture=True)  # the node logs them, as all that is logged
     if select.select([ends], [], [], 0.0)[0]:
         return 0
