@@ -94,43 +94,56 @@ def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     parts: list[object] = [
         LAYOUT, numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
         [(name, getattr(numba.config, name, None)) for name in SETTINGS]]
-    ours = {_top(__name__), _top(dispatcher.py_func.__module__)}
-    todo: list[Any] = [dispatcher]
-    seen: set[FunctionType] = set()
+    ours = frozenset((_top(__name__), _top(dispatcher.py_func.__module__)))
+    todo = [dispatcher]
+    seen: set[Any] = set()
     while len(todo) > 0:
-        value = todo.pop()
-        is_kernel = isinstance(value, ni.Dispatcher)
-        if is_kernel:
-            options = value.targetoptions
-            parts += [(name, _ordered(options[name])) for name in sorted(options)]
-            value = value.py_func
-        value = getattr(value, '_defn', value)      # the function that defines an intrinsic
-        if isinstance(value, FunctionType):
-            if value not in seen and (is_kernel or _top(value.__module__) in ours):
-                seen.add(value)
-                codes = list(_codes(value.__code__))
-                parts += [value.__module__, value.__qualname__]
-                for code in codes:
-                    parts += [code.co_code.hex(), code.co_names, code.co_varnames,
-                              code.co_freevars, [_ordered(item) for item in code.co_consts
-                                                 if not isinstance(item, CodeType)]]
-                cells = value.__closure__ or ()
-                todo += [value.__defaults__, [cell.cell_contents for cell in cells]]
-                todo += _globals(value, {name for code in codes for name in code.co_names}, ours)
-        elif isinstance(value, tuple | list):
-            parts.append(len(value))
-            todo += value
-        elif isinstance(value, np.ndarray | np.generic):
-            parts += [str(value.dtype), value.shape, value.tobytes().hex()]
-        elif isinstance(value, numba.types.Type | np.dtype):
-            parts.append(str(value))
-        elif isinstance(value, type):
-            members = value if issubclass(value, Enum) else ()
-            parts += [getattr(value, '_fields', ()),
-                      [(member.name, member.value) for member in members]]
-        elif isinstance(value, int | float | complex | str | bytes | None):
-            parts.append(value)
+        if (value := todo.pop()) not in seen:
+            seen.add(value)
+            own, used = _described(value, ours)
+            parts.append(own)
+            todo += used
     return hashlib.sha256(repr(parts).encode()).digest()
+
+
+@functools.cache
+def _described(value: Any, ours: frozenset[str]) -> tuple[str, list[Any]]:
+    """Return a digest of a kernel or function without those that it uses, and these."""
+    parts: list[object] = []
+    if isinstance(value, ni.Dispatcher):
+        options = value.targetoptions
+        parts += [(name, _ordered(options[name])) for name in sorted(options)]
+        value = value.py_func
+    function: FunctionType = getattr(value, '_defn', value)  # what defines an intrinsic
+    codes = list(_codes(function.__code__))
+    parts += [function.__module__, function.__qualname__]
+    for code in codes:
+        parts += [code.co_code.hex(), code.co_names, code.co_varnames, code.co_freevars, [
+            _ordered(item) for item in code.co_consts if not isinstance(item, CodeType)]]
+    used: list[Any] = []
+    todo: list[Any] = [
+        function.__defaults__, [cell.cell_contents for cell in function.__closure__ or ()],
+        *_globals(function, {name for code in codes for name in code.co_names}, ours)]
+    while len(todo) > 0:
+        item = todo.pop()
+        if isinstance(item, ni.Dispatcher) or (isinstance(
+                own := getattr(item, '_defn', item), FunctionType)
+                and _top(own.__module__) in ours):
+            used.append(item)
+        elif isinstance(item, tuple | list):
+            parts.append(len(item))
+            todo += item
+        elif isinstance(item, np.ndarray | np.generic):
+            parts += [str(item.dtype), item.shape, item.tobytes().hex()]
+        elif isinstance(item, numba.types.Type | np.dtype):
+            parts.append(str(item))
+        elif isinstance(item, type):
+            members = item if issubclass(item, Enum) else ()
+            parts += [getattr(item, '_fields', ()),
+                      [(member.name, member.value) for member in members]]
+        elif isinstance(item, int | float | complex | str | bytes | None):
+            parts.append(item)
+    return hashlib.sha256(repr(parts).encode()).hexdigest(), used
 
 
 def _top(module: str) -> str:
@@ -150,7 +163,7 @@ def _ordered(value: object) -> str:
     return repr(sorted(map(repr, value)) if isinstance(value, set | frozenset) else value)
 
 
-def _globals(function: FunctionType, names: set[str], ours: set[str]) -> Iterator[object]:
+def _globals(function: FunctionType, names: set[str], ours: frozenset[str]) -> Iterator[object]:
     """Yield the global names of a function and their values, also from modules of this package."""
     spaces = [function.__globals__]
     for name in sorted(names):

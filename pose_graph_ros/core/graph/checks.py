@@ -199,8 +199,7 @@ def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
     if np.any(wrong):
         raise GraphUpdateError(
             f'{name}: expected {what}s in 0..{known.end - 1}, got {array[wrong][0]}')
-    gone = known.rows(array) < 0
-    if np.any(gone):
+    if known.present is not None and np.any(gone := known.rows(array) < 0):
         raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
 
 

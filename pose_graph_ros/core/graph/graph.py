@@ -42,6 +42,7 @@ class Graph:
     def __init__(self, original: 'Graph | None' = None) -> None:
         """Begin with an empty graph; one for a copy of another one is interrupted with that."""
         self.memory: tb.Memory = tb.Memory(None if original is None else original.memory)
+        self.ensure(tb.FIRST_ROWS, tb.FIRST_ROWS)
         self.n_moves = 0    # how often `set_poses` or new measurements have moved the nodes
         self._updating = False
 

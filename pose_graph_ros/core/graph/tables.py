@@ -263,11 +263,11 @@ class Memory:
         self.head[FREE_CLIQUE] = self.head[NEWEST] = self.head[FIXED] = self.head[LOOSE] = -1
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
-        for name in NAMES:  # with 8 MB for values, graphs of some thousand nodes never copy them
-            self.ensure(name, {'scalars': 1, 'interrupt': 2}.get(name) or {
-                'pool_f': 256, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
-        self.ensure('work_f', 256)  # for `chain` and `step`; fronts ask for more
-        self.ensure('log', 64)  # for `transaction_log.begin` of an empty graph
+        # `Graph` adds those of its rows; with 8 MB for values, graphs of some thousand nodes never
+        # copy them; fronts ask for more work space than `chain` and `step` need
+        for name, rows in (('scalars', 1), ('interrupt', 2), ('pool_f', 256 * FIRST_ROWS),
+                           ('pool_i', 4 * FIRST_ROWS), ('work_f', 256)):
+            self.ensure(name, rows)
         if another is not None:
             self._tables['interrupt'] = another['interrupt']
             self.head[2 * NAMES.index('interrupt')] = another['interrupt'].ctypes.data
