@@ -10,11 +10,15 @@ further effect. At the end nothing is waited for that cannot be interrupted, suc
 or a solve: `ros2 launch` kills a node that does not end within 5 s.
 """
 
+import contextlib
+import ctypes
 import os
 import select
 import signal
 import sys
 from threading import Thread
+
+M_MMAP_THRESHOLD, LARGE = -3, 2**18     # of malloc.h; from which on a block is large [bytes]
 
 
 def main(args: list[str] | None = None) -> int:
@@ -33,14 +37,13 @@ def main(args: list[str] | None = None) -> int:
 
     from pose_graph_ros.core.exceptions import ConfigError, NumbaVersionError
     try:
-        from pose_graph_ros.core.compiled import pages
         from pose_graph_ros.ros.node import PoseGraphNode
         from pose_graph_ros.ros.spinning import Spinner
     except NumbaVersionError as error:
         print(f'pose_graph_node: {error}', file=sys.stderr)
         return 2
 
-    pages.return_when_freed()
+    return_when_freed()
     logging.captureWarnings(capture=True)  # the node logs them, as all that is logged
     if select.select([ends], [], [], 0.0)[0]:
         return 0
@@ -71,6 +74,16 @@ def main(args: list[str] | None = None) -> int:
     node.destroy_node()
     rclpy.try_shutdown()
     return 0
+
+
+def return_when_freed() -> None:
+    """
+    Let the C library give large blocks pages of their own, which go when they are freed.
+
+    Else it keeps up to 64 MB in each heap once a block as large was freed.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # on another system than Linux
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 if __name__ == '__main__':

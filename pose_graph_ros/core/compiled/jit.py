@@ -34,10 +34,6 @@ Function = Callable[..., Any]
 # from the caller that it is first compiled for, so its code would depend on the order of calls.
 OPTIONS = MappingProxyType({
     'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, 'fastmath': {'contract'}})
-# Numba's run time counts references to arrays, which took a fifth of the computing time. OWNS is
-# for kernels that allocate arrays, BORROWS for all others.
-OWNS = MappingProxyType({'_nrt': True})
-BORROWS = MappingProxyType({'_nrt': False})
 
 # Types of arguments in signatures: numbers, then C-contiguous arrays.
 INTEGER, NUMBER, FLAG = types.int64, types.float64, types.boolean
@@ -62,8 +58,8 @@ def kernel(function: Function | None = None, *, signature: Signature | None = No
     """
     if function is None:
         return functools.partial(kernel, signature=signature, allocates=allocates, **options)
-    ownership = OWNS if allocates else BORROWS
-    compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
+    # the run time counts references to arrays, which took a fifth of the computing time
+    compiled = numba.njit(**{**OPTIONS, '_nrt': allocates, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         # Calls from other kernels pass every integer as int64: Numba would compile one version for
         # each width and each constant, which triples the time.

@@ -22,6 +22,7 @@ whole process and stay as they are.
 """
 
 from collections.abc import Iterator
+import contextlib
 from enum import Enum
 import functools
 import hashlib
@@ -94,56 +95,43 @@ def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     parts: list[object] = [
         LAYOUT, numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
         [(name, getattr(numba.config, name, None)) for name in SETTINGS]]
-    ours = frozenset((_top(__name__), _top(dispatcher.py_func.__module__)))
-    todo = [dispatcher]
-    seen: set[Any] = set()
+    ours = {_top(__name__), _top(dispatcher.py_func.__module__)}
+    todo: list[Any] = [dispatcher]
+    seen: set[FunctionType] = set()
     while len(todo) > 0:
-        if (value := todo.pop()) not in seen:
-            seen.add(value)
-            own, used = _described(value, ours)
-            parts.append(own)
-            todo += used
-    return hashlib.sha256(repr(parts).encode()).digest()
-
-
-@functools.cache
-def _described(value: Any, ours: frozenset[str]) -> tuple[str, list[Any]]:
-    """Return a digest of a kernel or function without those that it uses, and these."""
-    parts: list[object] = []
-    if isinstance(value, ni.Dispatcher):
-        options = value.targetoptions
-        parts += [(name, _ordered(options[name])) for name in sorted(options)]
-        value = value.py_func
-    function: FunctionType = getattr(value, '_defn', value)  # what defines an intrinsic
-    codes = list(_codes(function.__code__))
-    parts += [function.__module__, function.__qualname__]
-    for code in codes:
-        parts += [code.co_code.hex(), code.co_names, code.co_varnames, code.co_freevars, [
-            _ordered(item) for item in code.co_consts if not isinstance(item, CodeType)]]
-    used: list[Any] = []
-    todo: list[Any] = [
-        function.__defaults__, [cell.cell_contents for cell in function.__closure__ or ()],
-        *_globals(function, {name for code in codes for name in code.co_names}, ours)]
-    while len(todo) > 0:
-        item = todo.pop()
-        if isinstance(item, ni.Dispatcher) or (isinstance(
-                own := getattr(item, '_defn', item), FunctionType)
-                and _top(own.__module__) in ours):
-            used.append(item)
-        elif isinstance(item, tuple | list):
-            parts.append(len(item))
-            todo += item
-        elif isinstance(item, np.ndarray | np.generic):
-            parts += [str(item.dtype), item.shape, item.tobytes().hex()]
-        elif isinstance(item, numba.types.Type | np.dtype):
-            parts.append(str(item))
-        elif isinstance(item, type):
-            members = item if issubclass(item, Enum) else ()
-            parts += [getattr(item, '_fields', ()),
+        value = todo.pop()
+        is_kernel = isinstance(value, ni.Dispatcher)
+        if is_kernel:
+            options = value.targetoptions
+            parts += [(name, _ordered(options[name])) for name in sorted(options)]
+            value = value.py_func
+        value = getattr(value, '_defn', value)      # the function that defines an intrinsic
+        if isinstance(value, FunctionType):
+            if value not in seen and (is_kernel or _top(value.__module__) in ours):
+                seen.add(value)
+                codes = list(_codes(value.__code__))
+                parts += [value.__module__, value.__qualname__]
+                for code in codes:
+                    parts += [code.co_code.hex(), code.co_names, code.co_varnames,
+                              code.co_freevars, [_ordered(item) for item in code.co_consts
+                                                 if not isinstance(item, CodeType)]]
+                cells = value.__closure__ or ()
+                todo += [value.__defaults__, [cell.cell_contents for cell in cells]]
+                todo += _globals(value, {name for code in codes for name in code.co_names}, ours)
+        elif isinstance(value, tuple | list):
+            parts.append(len(value))
+            todo += value
+        elif isinstance(value, np.ndarray | np.generic):
+            parts += [str(value.dtype), value.shape, value.tobytes().hex()]
+        elif isinstance(value, numba.types.Type | np.dtype):
+            parts.append(str(value))
+        elif isinstance(value, type):
+            members = value if issubclass(value, Enum) else ()
+            parts += [getattr(value, '_fields', ()),
                       [(member.name, member.value) for member in members]]
-        elif isinstance(item, int | float | complex | str | bytes | None):
-            parts.append(item)
-    return hashlib.sha256(repr(parts).encode()).hexdigest(), used
+        elif isinstance(value, int | float | complex | str | bytes | None):
+            parts.append(value)
+    return hashlib.sha256(repr(parts).encode()).digest()
 
 
 def _top(module: str) -> str:
@@ -163,17 +151,13 @@ def _ordered(value: object) -> str:
     return repr(sorted(map(repr, value)) if isinstance(value, set | frozenset) else value)
 
 
-def _globals(function: FunctionType, names: set[str], ours: frozenset[str]) -> Iterator[object]:
-    """Yield the global names of a function and their values, also from modules of this package."""
-    spaces = [function.__globals__]
-    for name in sorted(names):
-        value = function.__globals__.get(name)
-        if isinstance(value, ModuleType) and _top(value.__name__) in ours:
-            spaces.append(vars(value))
-    for space in spaces:
-        for name in sorted(names & space.keys()):
-            yield name
-            yield space[name]
+def _globals(function: FunctionType, names: set[str], ours: set[str]) -> list[tuple[str, Any]]:
+    """Return the globals that a function names, also from modules of this package."""
+    own = function.__globals__
+    modules = [own[name] for name in sorted(names & own.keys())
+               if isinstance(own[name], ModuleType)]
+    spaces = [own, *(vars(each) for each in modules if _top(each.__name__) in ours)]
+    return [(name, space[name]) for space in spaces for name in sorted(names & space.keys())]
 
 
 # --- the files ----------------------------------------------------------------------------------
@@ -198,12 +182,9 @@ class KernelCache:
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the code for a signature; None if there is none that is valid."""
         for path in self._files(signature):
-            code = self._code(path)
-            try:
-                if code is not None:
+            with _tolerated('read', path.parent):
+                if (code := self._code(path)) is not None:
                     return ni.loaded(target_context, code)
-            except Exception as error:
-                _warn('read', path.parent, error)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
@@ -212,13 +193,11 @@ class KernelCache:
         if self._own is None or result.library.has_dynamic_globals:
             return
         path = next(self._files(signature))
-        try:
+        with _tolerated('written', path.parent):
             code = ni.dumped(result)
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
                 file.write(fingerprint(self._dispatcher) + hashlib.sha256(code).digest() + code)
             os.replace(file.name, path)
-        except Exception as error:
-            _warn('written', path.parent, error)
 
     def _files(self, signature: Any) -> Iterator[Path]:
         """Yield the places of the code for a signature."""
@@ -230,27 +209,26 @@ class KernelCache:
 
     def _code(self, path: Path) -> bytes | None:
         """Return the code in a file; None if it is not valid."""
-        try:
+        with _tolerated('read', path.parent), contextlib.suppress(FileNotFoundError):
             kept = path.read_bytes()
-        except FileNotFoundError:
-            return None
-        except OSError as error:
-            _warn('read', path.parent, error)
-            return None
-        made_from, check_sum, code = kept[:32], kept[32:64], kept[64:]
-        if made_from != fingerprint(self._dispatcher):
-            return None
-        if check_sum != hashlib.sha256(code).digest():
-            _warn('read', path.parent, ValueError('the check sum is wrong'))
-            return None
-        return code
+            made_from, check_sum, code = kept[:32], kept[32:64], kept[64:]
+            if made_from == fingerprint(self._dispatcher):
+                if check_sum != hashlib.sha256(code).digest():
+                    raise ValueError('the check sum is wrong')
+                return code
+        return None
+
+
+@contextlib.contextmanager
+def _tolerated(what: str, folder: Path) -> Iterator[None]:
+    """Log an exception in place of raising it."""
+    try:
+        yield
+    except Exception as error:
+        _warn_once(f'the compiled kernels in {folder} could not be {what}: '
+                   f'{type(error).__name__}: {error}; they are compiled again')
 
 
 @functools.cache
 def _warn_once(text: str) -> None:
     logger.warning('%s', text)
-
-
-def _warn(what: str, folder: Path, error: Exception) -> None:
-    _warn_once(f'the compiled kernels in {folder} could not be {what}: '
-               f'{type(error).__name__}: {error}; they are compiled again')

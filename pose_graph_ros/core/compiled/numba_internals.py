@@ -71,25 +71,22 @@ def dumped(result: CompileResult) -> bytes:
     functions that were compiled into it. Of the environments only constants are read, and the
     types of all variables are for people.
     """
-    module = result.library._get_module_for_linking()  # noqa: SLF001
-    names = {each.name for each in (*module.functions, *module.global_variables)
-             if not each.is_declaration}
     (name, kind, (code, bitcode)), *parts, _, reload_init, environments = (
         result._reduce())  # noqa: SLF001
     kept = tuple(each for each in environments if len(each.consts) > 0)
     empty = ll.parse_assembly('').as_bitcode()
     return bytes(serialize.dumps((
-        (name, kind, (code, empty)), (*parts, '', reload_init, kept), names,
-        zlib.compress(bitcode))))
+        (name, kind, (code, empty)), *parts, '', reload_init, kept, zlib.compress(bitcode))))
 
 
 def loaded(target_context: Any, code: bytes) -> CompileResult:
     """Return the code of `dumped`, ready to be called."""
     # what Numba does when it refreshes the context, but that also imports all that can be compiled
     rtsys.initialize(target_context)
-    library, parts, names, bitcode = pickle.loads(code)
-    target_context.codegen()._engine._defined_symbols |= names  # noqa: SLF001
-    result = CompileResult._rebuild(target_context, library, *parts)  # noqa: SLF001
+    library, descriptor, *parts, bitcode = pickle.loads(code)
+    target_context.codegen()._engine._defined_symbols |= {  # noqa: SLF001
+        descriptor.llvm_func_name, descriptor.llvm_cpython_wrapper_name}
+    result = CompileResult._rebuild(target_context, library, descriptor, *parts)  # noqa: SLF001
     # the kernel may be a part of one that is compiled later
     result.library._get_module_for_linking = functools.cache(  # noqa: SLF001
         lambda: ll.parse_bitcode(zlib.decompress(bitcode)))

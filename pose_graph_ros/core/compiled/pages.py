@@ -3,26 +3,12 @@
 """Memory for arrays that grow: what is not written to takes none, what is freed goes at once."""
 
 import contextlib
-import ctypes
 import math
 import mmap
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-LARGE = 2**18   # from which on an array has pages of its own [bytes]
-M_MMAP_THRESHOLD = -3   # of malloc.h
-
-
-def return_when_freed() -> None:
-    """
-    Let the C library, too, give large blocks pages of their own, which go when they are freed.
-
-    Else it keeps up to 64 MB in each heap once a block as large was freed.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # on another system than Linux
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
@@ -33,7 +19,7 @@ def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     are private: a process that is forked from this one gets copies of those that it writes to.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < LARGE:
+    if size < 2**18:
         return np.zeros(shape, dtype)
     pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with contextlib.suppress(OSError):  # a kernel without huge pages

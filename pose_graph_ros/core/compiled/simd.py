@@ -41,10 +41,8 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, type_, _LLVM)
 
 
-def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Apply Numba's decorator, which has no type annotations."""
-    compiled: Callable[..., Any] = intrinsic(function)
-    return compiled
+# Numba's decorator has no type annotations.
+_intrinsic: Callable[..., Any] = intrinsic
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -> Any:
