@@ -32,8 +32,7 @@ PARTS = {
                   'docs/conventions', 'docs/fleet', 'docs/docker'],
     'Inside': ['docs/design', 'docs/solver', 'docs/scale', 'docs/reliability', 'docs/security',
                'CONTRIBUTING'],
-    'Measured': ['docs/benchmarks/README', 'docs/benchmarks/*/README',
-                 'Under load with 1000 nodes <docs/benchmarks/load/1000_nodes/README>']}
+    'Measured': ['docs/benchmarks/README', 'docs/benchmarks/*/README']}
 """What the list beside the pages has; a page that it lacks is an error."""
 
 
