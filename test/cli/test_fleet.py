@@ -216,14 +216,25 @@ def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
 
 def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
     write_drives(tmp_path / 'bags', 12)
-    out = tmp_path / 'out'
-    # a job in the background, as the tests may be, ignores the signal
-    code = ('import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-            'from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))')
-    words = [FLEET[0], '-c', code, 'fleet', str(tmp_path / 'bags'), '-o', str(out),
+    out, file = tmp_path / 'out', tmp_path / 'slow.py'
+    # a job in the background, as the tests may be, ignores the signal; and without a pause all
+    # may be done before the signal comes
+    file.write_text(
+        'import os, signal, sys, time\n'
+        'from pose_graph_ros.cli.fleet import cluster\n'
+        'from pose_graph_ros.cli.main import main\n'
+        'do = cluster.do\n'
+        'def do_later(task):\n'
+        "    time.sleep(float(os.environ['PAUSE']))\n"
+        '    return do(task)\n'
+        'cluster.do = do_later\n'
+        "if __name__ == '__main__':\n"
+        '    signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        '    sys.exit(main(sys.argv[1:]))\n')
+    words = [FLEET[0], str(file), 'fleet', str(tmp_path / 'bags'), '-o', str(out),
              '--workers', '2']
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               start_new_session=True)
+                               start_new_session=True, env=dict(os.environ, PAUSE='2'))
     wait_until(lambda: finished(out) >= 3, process)
     workers = workers_of(process)
     os.killpg(process.pid, signal.SIGINT)   # all processes, as a terminal does
@@ -235,7 +246,8 @@ def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
     assert f'{done} drives: {done} replayed' in text
     assert (out / 'index.html').is_file()
     assert len(psutil.wait_procs(workers, timeout=10.0)[1]) == 0
-    again = subprocess.run(words, capture_output=True, text=True, check=True, timeout=DEADLINE)
+    again = subprocess.run(words, capture_output=True, text=True, check=True, timeout=DEADLINE,
+                           env=dict(os.environ, PAUSE='0'))
     assert int(again.stdout.rpartition(' drives: ')[2].split()[0]) <= 9
 
 
