@@ -187,23 +187,30 @@ def test_what_cannot_be_read_is_told_in_a_line_each(
         '4 drives: 0 replayed, 2 kept, 2 failed')
 
 
+# The tool, with something that a worker does first for each drive. A job in the background, as the
+# tests may be, ignores SIGINT.
+TOOL = """
+import os, signal, sys, time
+from pose_graph_ros.cli.fleet import cluster
+from pose_graph_ros.cli.main import main
+do = cluster.do
+def do_after(task):
+    {first}
+    return do(task)
+cluster.do = do_after
+if __name__ == '__main__':
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.exit(main(sys.argv[1:]))
+"""
+
+
 def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
     fleet: Any, bags: Path, tmp_path: Path,
 ) -> None:
     # as if it needed more memory than there is
     out, file = tmp_path / 'out', tmp_path / 'deadly.py'
-    file.write_text(
-        'import os, signal, sys\n'
-        'from pose_graph_ros.cli.fleet import cluster\n'
-        'from pose_graph_ros.cli.main import main\n'
-        'do = cluster.do\n'
-        'def do_or_die(task):\n'
-        "    if task.recording.name == 'day01':\n"
-        '        os.kill(os.getpid(), signal.SIGKILL)\n'
-        '    return do(task)\n'
-        'cluster.do = do_or_die\n'
-        "if __name__ == '__main__':\n"
-        '    sys.exit(main(sys.argv[1:]))\n')
+    file.write_text(TOOL.format(first=(
+        "if task.recording.name == 'day01': os.kill(os.getpid(), signal.SIGKILL)")))
     done = subprocess.run([FLEET[0], file, 'fleet', bags, '-o', out, '--workers', '2'],
                           capture_output=True, text=True, check=False, timeout=DEADLINE)
     assert done.returncode == 1, done.stderr
@@ -217,20 +224,8 @@ def test_a_bag_that_kills_its_workers_fails_and_the_others_go_on(
 def test_ctrl_c_keeps_what_is_done(tmp_path: Path) -> None:
     write_drives(tmp_path / 'bags', 12)
     out, file = tmp_path / 'out', tmp_path / 'slow.py'
-    # a job in the background, as the tests may be, ignores the signal; and without a pause all
-    # may be done before the signal comes
-    file.write_text(
-        'import os, signal, sys, time\n'
-        'from pose_graph_ros.cli.fleet import cluster\n'
-        'from pose_graph_ros.cli.main import main\n'
-        'do = cluster.do\n'
-        'def do_later(task):\n'
-        "    time.sleep(float(os.environ['PAUSE']))\n"
-        '    return do(task)\n'
-        'cluster.do = do_later\n'
-        "if __name__ == '__main__':\n"
-        '    signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-        '    sys.exit(main(sys.argv[1:]))\n')
+    # without a pause all may be done before the signal comes
+    file.write_text(TOOL.format(first="time.sleep(float(os.environ['PAUSE']))"))
     words = [FLEET[0], str(file), 'fleet', str(tmp_path / 'bags'), '-o', str(out),
              '--workers', '2']
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
