@@ -58,7 +58,8 @@ def kernel(function: Function | None = None, *, signature: Signature | None = No
     """
     if function is None:
         return functools.partial(kernel, signature=signature, allocates=allocates, **options)
-    # the run time counts references to arrays, which took a fifth of the computing time
+    # Numba's run time counts references to arrays, which took a fifth of the computing time; only
+    # kernels that allocate need it
     compiled = numba.njit(**{**OPTIONS, '_nrt': allocates, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
         # Calls from other kernels pass every integer as int64: Numba would compile one version for
