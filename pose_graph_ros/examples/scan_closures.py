@@ -20,6 +20,7 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import LaserScan
@@ -40,7 +41,9 @@ class ScanClosures(Node):
         self._scans: list[tuple[int, np.ndarray]] = []  # stamps [ns], points in base_link [m]
         self._next = 0                                  # of these, which is compared next
         self._closures = self.create_publisher(PoseWithCovarianceStamped, 'loop_closure', 100)
-        self.create_subscription(LaserScan, 'scan', self._keep, qos_profile_sensor_data)
+        self.create_subscription(
+            LaserScan, 'scan', self._keep, qos_profile_sensor_data,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self.create_subscription(Path, 'path', self._compare, 1)
 
     def _keep(self, scan: LaserScan) -> None:

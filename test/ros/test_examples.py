@@ -86,12 +86,14 @@ def test_scans_of_a_second_round_correct_the_path(node: NodeProcess, client: Cli
 
     with subprocess.Popen(
         [sys.executable, '-m', 'pose_graph_ros.examples.scan_closures', '--ros-args',
-         '-p', f'laser:={list(LASER)}'], env=node.env,
+         '-p', f'laser:={list(LASER)}',
+         # else scans that come faster than they are compared are lost, and with them closures
+         '-p', 'qos_overrides./scan.subscription.reliability:=reliable',
+         '-p', 'qos_overrides./scan.subscription.depth:=1000'], env=node.env,
     ) as example:
         try:
             client.spin_until(lambda: scans.get_subscription_count() > 0, 'scans are heard')
-            # a busy machine loses some of the scans that come faster than they are compared, so
-            # that the end, until enough of them match, is in real time
+            # the end, until enough scans match, is in real time
             for step in range(1550):
                 if len(closures) >= 25 and stamp_ns(closures[-1]) * 1e-9 > START + 91.5:
                     break
